@@ -1,2 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The depth and pose networks (method, sections 3 and 4)."""
+"""The depth network and the pose network."""
+
+from cvcdepth_core.networks.depth import DEPTH_ENCODERS, INPUT_STRIDE, DepthNet, disparity_to_depth
+
+__all__ = ["DEPTH_ENCODERS", "INPUT_STRIDE", "DepthNet", "disparity_to_depth"]
