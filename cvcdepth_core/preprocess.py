@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a camera's picture to what the network sees, for the node, the bag tool and the trainer alike.
+
+Undistorting, rectifying and resizing happen in one resampling whose maps are built once per calibration. The picture is
+sampled on a grid that is finer than the network's by whole numbers, at least as fine as the picture itself, and the
+samples of each network pixel are averaged: that keeps what the network's resolution cannot show from aliasing into it.
+"""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from cvcdepth_core.calibration import Calibration, scale_intrinsics
+from cvcdepth_core.errors import ImageError, RigError
+from cvcdepth_core.images import Picture
+from cvcdepth_core.rig import Camera, Rig
+
+_MAX_OVERSAMPLING = 8
+
+
+class Rectifier:
+    """Takes one camera's raw pictures to rectified ones of `height` x `width` pixels.
+
+    `intrinsics` [3, 3] float64 belong to the rectified, resized picture, in its pixels (centres at the integers).
+    `visible`, bool [height, width], is False where the rectified picture shows nothing of the raw one.
+    """
+
+    def __init__(self, calibration: Calibration, height: int, width: int, rectified: bool = False) -> None:
+        image_width, image_height = calibration.image_size
+        self.height, self.width = height, width
+        self.image_size = calibration.image_size
+        self.intrinsics = scale_intrinsics(
+            calibration.rectified_intrinsics, (width / image_width, height / image_height)
+        )
+        x, y = _sampling_maps(calibration, self.intrinsics, (width, height), rectified)
+        inside = (x >= -0.5) & (x <= image_width - 0.5) & (y >= -0.5) & (y <= image_height - 0.5)
+        self.visible: NDArray[np.bool_] = self._average(255 * inside.astype(np.uint8)) == 255
+        self._maps = cv2.convertMaps(x, y, cv2.CV_16SC2)
+
+    def __call__(self, picture: Picture, camera: str) -> Picture:
+        """Rectify and resize `picture`, uint8 [h, w] or [h, w, 3], to uint8 [height, width] or [height, width, 3].
+
+        ImageError names the camera when the picture's size is not the calibration's.
+        """
+        found, want = (picture.shape[1], picture.shape[0]), self.image_size
+        if found != want:
+            raise ImageError(
+                f"camera {camera}: image of {found[0]}x{found[1]}, but its camera_info says {want[0]}x{want[1]}"
+            )
+        return self._average(cv2.remap(picture, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+
+    def _average(self, samples: NDArray[np.uint8]) -> Picture:
+        """Average the samples of each network pixel; INTER_AREA is exact for whole-number ratios."""
+        resized: Picture = cv2.resize(samples, (self.width, self.height), interpolation=cv2.INTER_AREA)
+        return resized
+
+
+class SurroundPreprocessor:
+    """The rectifiers of a whole rig.
+
+    `intrinsics` [N, 3, 3] float64 belong to the network's pictures. `valid`, bool [N, H, W], is False outside the raw
+    picture and where the vehicle itself is in view.
+    """
+
+    def __init__(self, rig: Rig, height: int, width: int) -> None:
+        self.names = rig.names
+        self._rectifiers = [Rectifier(c.calibration, height, width, c.rectified) for c in rig.cameras]
+        self.intrinsics = np.stack([rectifier.intrinsics for rectifier in self._rectifiers])
+        self.valid: NDArray[np.bool_] = np.stack(
+            [
+                rectifier.visible & (self_occlusion_mask(camera, rectifier) > 0.5)
+                for camera, rectifier in zip(rig.cameras, self._rectifiers, strict=True)
+            ]
+        )
+
+    def rectify(self, index: int, picture: Picture) -> Picture:
+        """Rectify and resize one camera's picture, by its index in the rig."""
+        return self._rectifiers[index](picture, self.names[index])
+
+
+def to_tensor(pictures: Sequence[Picture], device: torch.device | str = "cpu") -> torch.Tensor:
+    """Stack RGB pictures [H, W, 3] into the network's input: float32 [N, 3, H, W] in [0, 1]."""
+    stacked = torch.from_numpy(np.stack(pictures)).to(device)
+    return stacked.permute(0, 3, 1, 2).to(torch.float32).contiguous() / 255.0
+
+
+def self_occlusion_mask(camera: Camera, rectifier: Rectifier) -> NDArray[np.float32]:
+    """Return the camera's mask at the network's size, float32 [H, W] in [0, 1], 1 = valid, with soft edges (method, 2).
+
+    Without a mask file everything is valid. RigError names a file that cannot be read or has another size.
+    """
+    if camera.mask is None:
+        return np.ones((rectifier.height, rectifier.width), dtype=np.float32)
+    mask = _read_mask(camera.mask, camera.name)
+    try:
+        return rectifier(mask, camera.name).astype(np.float32) / 255.0
+    except ImageError as error:
+        raise RigError(f"mask {camera.mask}: {error}") from error
+
+
+def _read_mask(path: Path, camera: str) -> NDArray[np.uint8]:
+    try:
+        mask = cv2.imdecode(np.frombuffer(path.read_bytes(), dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
+    except (OSError, cv2.error) as error:
+        raise RigError(f"camera {camera}: mask {path} cannot be read: {error}") from error
+    if mask is None:
+        raise RigError(f"camera {camera}: mask {path} is not an image")
+    found: NDArray[np.uint8] = mask
+    return found
+
+
+def _sampling_maps(
+    calibration: Calibration, intrinsics: NDArray[np.float64], size: tuple[int, int], rectified: bool
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Where each sample of the fine grid lies in the raw picture: x and y, float32 [H oy, W ox], in pixels."""
+    if rectified:
+        source, distortion, rotation = calibration.rectified_intrinsics, np.zeros(4), np.eye(3)
+    else:
+        source, distortion, rotation = calibration.raw_intrinsics, calibration.distortion, calibration.rotation
+    ox, oy = (_oversampling(source[axis, axis] / intrinsics[axis, axis]) for axis in (0, 1))
+    fine = scale_intrinsics(intrinsics, (ox, oy))
+    fisheye = calibration.distortion_model == "equidistant" and not rectified
+    build = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
+    x, y = build(source, distortion, rotation, fine, (size[0] * ox, size[1] * oy), cv2.CV_32FC1)
+    return x, y
+
+
+def _oversampling(pixels_per_network_pixel: float) -> int:
+    """Samples per network pixel along one axis: the next whole number, bounded for calibrations that zoom far out."""
+    return min(max(1, math.ceil(pixels_per_network_pixel - 1e-6)), _MAX_OVERSAMPLING)
