@@ -131,5 +131,5 @@ def _sampling_maps(
 
 
 def _oversampling(pixels_per_network_pixel: float) -> int:
-    """Samples per network pixel along one axis: the next whole number, bounded for calibrations that zoom far out."""
+    """Round up to the samples per network pixel along one axis; bounded for calibrations that zoom far out."""
     return min(max(1, math.ceil(pixels_per_network_pixel - 1e-6)), _MAX_OVERSAMPLING)

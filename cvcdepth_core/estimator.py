@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Surround pictures in, metric depth out: the one estimator behind the node, the bag tool and the evaluation."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from cvcdepth_core.checkpoint import DepthModelSpec, load_checkpoint
+from cvcdepth_core.errors import ConfigError
+from cvcdepth_core.images import Picture
+from cvcdepth_core.networks import DepthNet, disparity_to_depth
+from cvcdepth_core.preprocess import SurroundPreprocessor, to_tensor
+from cvcdepth_core.rig import Rig
+
+
+@dataclass(frozen=True, eq=False)
+class SurroundDepth:
+    """What was estimated for one surround set; every array holds the cameras in the rig's order."""
+
+    depth: NDArray[np.float32]
+    """[N, H, W] metres along each camera's optical axis, NaN where unknown (REP 118)."""
+    pictures: NDArray[np.uint8]
+    """[N, H, W, 3] RGB, rectified: pixel by pixel what `depth` describes."""
+    intrinsics: NDArray[np.float64]
+    """[N, 3, 3] of those pictures, pixel centres at the integers."""
+
+
+class DepthEstimator:
+    """A depth network on a device."""
+
+    def __init__(self, network: DepthNet, spec: DepthModelSpec, model_id: str, device: str = "auto") -> None:
+        """`model_id` is what reports call the weights; ConfigError when `device` does not exist here."""
+        self.spec = spec
+        self.model_id = model_id
+        self.device = _resolve_device(device)
+        self._network = network.eval().to(self.device)
+
+    @classmethod
+    def from_checkpoint(cls, path: Path, device: str = "auto") -> "DepthEstimator":
+        """Load a checkpoint file; CheckpointError names what is wrong with it."""
+        checkpoint = load_checkpoint(path)
+        model_id = f"{checkpoint.path.name} sha256:{checkpoint.sha256[:12]}"
+        return cls(checkpoint.build_depth_net(), checkpoint.spec, model_id, device)
+
+    @classmethod
+    def untrained(cls, spec: DepthModelSpec, device: str = "auto", seed: int = 0) -> "DepthEstimator":
+        """Build a network with random weights: its depth has the right form and no meaning."""
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            network = DepthNet(spec.encoder)
+        return cls(network, spec, f"untrained {spec.encoder} (random weights, seed {seed})", device)
+
+    def estimate(self, pictures: Sequence[Picture], fx: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Return depth [N, H, W] in metres of RGB pictures [H, W, 3]; `fx` [N] is in pixels of those pictures."""
+        images = to_tensor(pictures, self.device)
+        with torch.inference_mode():
+            depth = disparity_to_depth(
+                self._network(images),
+                torch.as_tensor(fx, dtype=torch.float32, device=self.device),
+                self.spec.min_depth,
+                self.spec.max_depth,
+                self.spec.focal_scale,
+            )
+        metres: NDArray[np.float32] = depth[:, 0].cpu().numpy()
+        return metres
+
+
+class SurroundDepthEstimator:
+    """A depth estimator for one rig: rectifies each camera's picture and estimates depth for a whole set.
+
+    `preprocessor` holds what belongs to the rig: intrinsics and validity of the network's pictures.
+    """
+
+    def __init__(self, rig: Rig, estimator: DepthEstimator) -> None:
+        self.rig = rig
+        self.estimator = estimator
+        self.preprocessor = SurroundPreprocessor(rig, estimator.spec.height, estimator.spec.width)
+
+    def rectify(self, index: int, picture: Picture) -> Picture:
+        """Take the picture of the camera with this index in the rig to the network's view of it."""
+        return self.preprocessor.rectify(index, picture)
+
+    def estimate(self, rectified: Sequence[Picture]) -> SurroundDepth:
+        """Estimate one set from its rectified pictures [H, W, 3], in the rig's order."""
+        intrinsics = self.preprocessor.intrinsics
+        depth = self.estimator.estimate(rectified, intrinsics[:, 0, 0])
+        return SurroundDepth(
+            depth=np.where(self.preprocessor.valid, depth, np.float32(np.nan)),
+            pictures=np.stack(rectified),
+            intrinsics=intrinsics,
+        )
+
+
+def _resolve_device(name: str) -> torch.device:
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise ConfigError(f"device: '{name}' is not available: {str(error).splitlines()[0]}") from error
+    return device
