@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The pose network: two images in temporal order to one small rigid motion (method section 4)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F  # noqa: N812 - the field's name for it
+
+from cvcdepth_core.errors import ConfigError
+from cvcdepth_core.networks.resnet import RESNET_BLOCKS, ResNetEncoder
+
+POSE_ENCODERS: tuple[str, ...] = tuple(RESNET_BLOCKS)
+
+_OUTPUT_SCALE = 0.01
+_MAX_TRANSLATION = 4.0
+
+
+class PoseNet(nn.Module):
+    """Encoder over image pairs, views fused by the mean of their features, one decoder.
+
+    One view is the front camera's pose network; all views of the rig are the joint pose of SurroundDepth and VFDepth.
+    """
+
+    def __init__(self, encoder: str = "resnet18") -> None:
+        super().__init__()
+        if encoder not in POSE_ENCODERS:
+            raise ConfigError(f"pose network: encoder is {encoder!r}, expected one of {', '.join(POSE_ENCODERS)}")
+        self.pose_encoder = ResNetEncoder(encoder, in_channels=6)
+        self.pose_decoder = PoseDecoder(self.pose_encoder.channels[-1])
+
+    def forward(self, earlier: Tensor, later: Tensor) -> tuple[Tensor, Tensor]:
+        """Return axis-angle [B, 3] (rad) and translation [B, 3] (m) of the motion seen by V views.
+
+        `earlier` and `later` are the two frames [B, V, 3, H, W] in [0, 1], always in temporal order.
+        """
+        views = earlier.shape[1]
+        pairs = torch.cat([earlier, later], dim=2).flatten(0, 1)
+        features: Tensor = self.pose_encoder(pairs)[-1]
+        fused = features.unflatten(0, (-1, views)).mean(dim=1)
+        vector: Tensor = self.pose_decoder(fused)
+        return vector[:, :3], vector[:, 3:].clamp(-_MAX_TRANSLATION, _MAX_TRANSLATION)
+
+
+class PoseDecoder(nn.Module):
+    """Four convolutions and a mean over the image."""
+
+    def __init__(self, in_channels: int) -> None:
+        super().__init__()
+        self.net = nn.ModuleList(
+            [
+                nn.Conv2d(in_channels, 256, 1),
+                nn.Conv2d(256, 256, 3, padding=1),
+                nn.Conv2d(256, 256, 3, padding=1),
+                nn.Conv2d(256, 6, 1),
+            ]
+        )
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Map [B, C, H, W] to the six numbers of a motion [B, 6]."""
+        for convolution in self.net[:-1]:
+            features = F.relu(convolution(features))
+        return _OUTPUT_SCALE * self.net[-1](features).mean(dim=(2, 3))
