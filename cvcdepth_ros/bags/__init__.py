@@ -1,2 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reading and writing recordings. Nothing here imports ROS."""
+
+from cvcdepth_ros.bags.recording import Recording, open_recording
+from cvcdepth_ros.bags.topics import LATCHED, RecordedMessage, Topic, qos_profile
+from cvcdepth_ros.bags.typestores import typestore
+
+__all__ = [
+    "LATCHED",
+    "RecordedMessage",
+    "Recording",
+    "Topic",
+    "open_recording",
+    "qos_profile",
+    "typestore",
+]

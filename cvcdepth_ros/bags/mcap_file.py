@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reading of one .mcap file, whole or damaged.
+
+The file is seen as blocks (a chunk, or a message outside of chunks) that can be read alone. An intact file's index
+says where they are; a file without one (cut by a power loss, or still being written) is scanned once from its
+beginning. Either way a block that cannot be read, or whose checksum is wrong, is skipped and reported.
+"""
+
+import io
+import struct
+from collections import Counter
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import IO, NamedTuple
+
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.reader import SeekingReader
+from mcap.records import Channel, Chunk, McapRecord, Message, Schema
+from mcap.stream_reader import breakup_chunk
+from mcap.summary import Summary
+from zstandard import ZstdError
+
+from cvcdepth_ros.bags.ordering import Source, in_time_order
+from cvcdepth_ros.bags.topics import RecordedMessage, Topic, joined_topics, recorded_qos
+
+MAGIC = b"\x89MCAP0\r\n"
+_RECORD_HEADER = struct.Struct("<BQ")  # opcode, length of what follows
+# What mcap and the decompressors raise on damaged bytes (lz4: RuntimeError; wrong CRC and text: ValueError).
+_DAMAGE = (McapError, ZstdError, struct.error, ValueError, RuntimeError, KeyError, OverflowError, MemoryError)
+
+
+class _Block(NamedTuple):
+    start: int
+    end: int
+    offset: int
+    channels: frozenset[int]
+    """Ids of the channels with messages in it; empty when the index does not say."""
+
+
+@dataclass
+class _Index:
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    counts: Counter[int] = field(default_factory=Counter)
+    """Messages per channel id."""
+    blocks: list[_Block] = field(default_factory=list)
+
+
+class McapFile:
+    """One .mcap file, see `RecordingFile`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.damage: list[str] = []
+        with path.open("rb") as stream:
+            self._size = stream.seek(0, io.SEEK_END)
+            self._index = self._indexed(stream) or self._scanned(stream)
+        self.start = min((block.start for block in self._index.blocks), default=None)
+        self.end = max((block.end for block in self._index.blocks), default=None)
+        self.topics = joined_topics([*self._channel_topics()], path)
+
+    def messages(self, topics: Collection[str], start: int, stop: int) -> Iterator[RecordedMessage]:
+        """Give the messages of `topics` with start <= log_time < stop, in time order."""
+        wanted = {id_: channel.topic for id_, channel in self._index.channels.items() if channel.topic in topics}
+        blocks = [
+            block
+            for block in self._index.blocks
+            if block.start < stop and block.end >= start and (not block.channels or block.channels & wanted.keys())
+        ]
+        with self.path.open("rb") as stream:
+            for message in in_time_order(
+                Source(block.start, partial(self._block_messages, stream, block, wanted)) for block in blocks
+            ):
+                if start <= message.log_time < stop:
+                    yield message
+
+    def _block_messages(self, stream: IO[bytes], block: _Block, wanted: dict[int, str]) -> Iterator[RecordedMessage]:
+        found = [
+            RecordedMessage(wanted[record.channel_id], record.log_time, record.data)
+            for record in self._intact_records(stream, block.offset)
+            if isinstance(record, Message) and record.channel_id in wanted
+        ]
+        return iter(sorted(found, key=lambda message: message.log_time))
+
+    def _indexed(self, stream: IO[bytes]) -> _Index | None:
+        """Read the index at the end of the file; None when there is none or it does not cover all messages."""
+        stream.seek(max(0, self._size - len(MAGIC)))
+        if stream.read() != MAGIC:
+            return None
+        stream.seek(0)
+        try:
+            summary = SeekingReader(stream).get_summary()
+        except _DAMAGE as error:
+            self._report(f"index unreadable ({_text(error)})")
+            return None
+        if summary is None or not _is_complete(summary):
+            return None
+        return _index_of(summary)
+
+    def _scanned(self, stream: IO[bytes]) -> _Index:
+        """Walk through the records from the beginning and index what is whole."""
+        index = _Index()
+        offset = len(MAGIC)
+        while (header := self._record_header(stream, offset)) and header[0] != Opcode.DATA_END:
+            records = self._intact_records(stream, offset)
+            _add_records(index, offset, records)
+            offset += _RECORD_HEADER.size + header[1]
+        if header is None:
+            self._report(
+                f"cut or unreadable from byte {offset} of {self._size} on, no index: "
+                f"{index.counts.total()} messages of the {len(index.blocks)} chunks before it recovered"
+            )
+        return index
+
+    def _record_header(self, stream: IO[bytes], offset: int) -> tuple[int, int] | None:
+        """Return opcode and length of the record at `offset`, or None when no whole record is there."""
+        stream.seek(offset)
+        header = stream.read(_RECORD_HEADER.size)
+        if len(header) < _RECORD_HEADER.size:
+            return None
+        opcode, length = _RECORD_HEADER.unpack(header)
+        # An opcode of 0 is not in use: it is what a preallocated, never written block reads as.
+        return (opcode, length) if opcode and offset + _RECORD_HEADER.size + length <= self._size else None
+
+    def _intact_records(self, stream: IO[bytes], offset: int) -> list[McapRecord]:
+        """Return what is in the record at `offset`, nothing when it is damaged (which is reported)."""
+        try:
+            return self._records_at(stream, offset)
+        except _DAMAGE as error:
+            self._report(f"chunk at byte {offset} skipped ({_text(error)})")
+            return []
+
+    def _records_at(self, stream: IO[bytes], offset: int) -> list[McapRecord]:
+        header = self._record_header(stream, offset)
+        if header is None:
+            raise McapError("no whole record there")
+        opcode, length = header
+        body = ReadDataStream(io.BytesIO(stream.read(length)))
+        if opcode == Opcode.CHUNK:
+            return _chunk_records(Chunk.read(body))
+        if opcode == Opcode.MESSAGE:
+            return [Message.read(body, length)]
+        if opcode == Opcode.SCHEMA:
+            return [Schema.read(body)]
+        return [Channel.read(body)] if opcode == Opcode.CHANNEL else []
+
+    def _channel_topics(self) -> Iterator[Topic]:
+        """Give a topic for every readable channel; the others are reported."""
+        for id_, count in self._index.counts.items():
+            channel = self._index.channels.get(id_)
+            schema = self._index.schemas.get(channel.schema_id) if channel else None
+            if channel is None or schema is None or channel.message_encoding != "cdr":
+                what = (
+                    f"{channel.topic} (encoding {channel.message_encoding!r})" if channel else f"unknown channel {id_}"
+                )
+                self._report(f"left out {what}: {count} messages are not CDR of a known type")
+                continue
+            definition = schema.data.decode(errors="replace")
+            qos = recorded_qos(channel.metadata.get("offered_qos_profiles"))
+            yield Topic(channel.topic, schema.name, count, qos, definition or None)
+
+    def _report(self, damage: str) -> None:
+        if damage not in self.damage:
+            self.damage.append(damage)
+
+
+def _is_complete(summary: Summary) -> bool:
+    """Say whether the index repeats all channels and knows all chunks; it may leave both out."""
+    statistics = summary.statistics
+    return (
+        statistics is not None
+        and len(summary.chunk_indexes) == statistics.chunk_count
+        and (statistics.chunk_count > 0 or statistics.message_count == 0)
+        and statistics.channel_message_counts.keys() <= summary.channels.keys()
+        and {channel.schema_id for channel in summary.channels.values()} <= summary.schemas.keys() | {0}
+    )
+
+
+def _index_of(summary: Summary) -> _Index:
+    counts = summary.statistics.channel_message_counts if summary.statistics else {}
+    blocks = [
+        _Block(
+            chunk.message_start_time,
+            chunk.message_end_time,
+            chunk.chunk_start_offset,
+            frozenset(chunk.message_index_offsets),
+        )
+        for chunk in summary.chunk_indexes
+    ]
+    return _Index(summary.schemas, summary.channels, Counter(counts), blocks)
+
+
+def _add_records(index: _Index, offset: int, records: list[McapRecord]) -> None:
+    """Add to the index what one record of the file, at `offset`, holds."""
+    messages = []
+    for record in records:
+        if isinstance(record, Schema):
+            index.schemas[record.id] = record
+        elif isinstance(record, Channel):
+            index.channels[record.id] = record
+            index.counts[record.id] += 0
+        elif isinstance(record, Message):
+            messages.append((record.log_time, record.channel_id))
+    if messages:
+        channels = Counter(channel for _, channel in messages)
+        index.counts.update(channels)
+        index.blocks.append(_Block(min(messages)[0], max(messages)[0], offset, frozenset(channels)))
+
+
+def _chunk_records(chunk: Chunk) -> list[McapRecord]:
+    if not chunk.compression and len(chunk.data) != chunk.uncompressed_size:
+        raise McapError(f"holds {len(chunk.data)} bytes, announces {chunk.uncompressed_size}")
+    return breakup_chunk(chunk, validate_crc=True)
+
+
+def _text(error: BaseException) -> str:
+    return str(error) or type(error).__name__

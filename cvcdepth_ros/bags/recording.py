@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recording, whatever it is stored in: `open_recording` guesses the format from the files' first bytes."""
+
+import shutil
+from collections.abc import Callable, Collection, Iterator, Sequence
+from functools import cached_property, partial
+from pathlib import Path, PurePath
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import yaml
+import zstandard
+from rosbags.serde import SerdeError
+from rosbags.typesys.store import Typestore
+
+from cvcdepth_core.errors import RecordingError
+from cvcdepth_ros.bags import mcap_file, ros1_file, sqlite_file
+from cvcdepth_ros.bags.mcap_file import McapFile
+from cvcdepth_ros.bags.ordering import Source, in_time_order
+from cvcdepth_ros.bags.ros1_file import Ros1File
+from cvcdepth_ros.bags.sqlite_file import SqliteFile
+from cvcdepth_ros.bags.topics import RecordedMessage, RecordingFile, Topic, joined_topics
+from cvcdepth_ros.bags.typestores import typestore_for
+
+_READERS: dict[bytes, Callable[[Path], RecordingFile]] = {
+    mcap_file.MAGIC: McapFile,
+    sqlite_file.MAGIC: SqliteFile,
+    ros1_file.MAGIC: Ros1File,
+}
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+_SUFFIXES = (".mcap", ".db3", ".bag", ".mcap.zstd", ".db3.zstd")
+_FOREVER = 2**63 - 1
+
+RecordingPath = str | Path
+
+
+def open_recording(path: RecordingPath | Sequence[RecordingPath]) -> "Recording":
+    """Open a rosbag2 folder, a single .mcap, .db3 or ROS 1 .bag file, or several that together are one recording.
+
+    Damaged parts are passed over and told in `Recording.damage`. Raises RecordingError, naming the path and what was
+    found there, when no message can be read.
+    """
+    paths = [Path(path)] if isinstance(path, str | Path) else [Path(part) for part in path]
+    return Recording(paths)
+
+
+class Recording:
+    """Topics and messages of one recording; use it as a context manager."""
+
+    path: Path
+    """What was opened (the first path when several were)."""
+    topics: dict[str, Topic]
+    """By name, in the order of the recording."""
+    start: int
+    """Log time of the first message, ns."""
+    end: int
+    """Log time of the last message, ns."""
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        if not paths:
+            raise RecordingError("no recording given: the list of paths is empty")
+        self.path = paths[0]
+        self._damage: list[str] = []
+        self._unpacked: TemporaryDirectory[str] | None = None
+        try:
+            self._files = self._open_files([file for path in paths for file in self._listed(path)])
+            self.topics = joined_topics([t for file in self._files for t in file.topics.values()], self.path)
+            self.start, self.end = self._span()
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> "Recording":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Remove what was unpacked."""
+        if self._unpacked:
+            self._unpacked.cleanup()
+            self._unpacked = None
+
+    @property
+    def damage(self) -> str | None:
+        """What could not be read, and why; None while all is well. It grows while messages are read."""
+        found = [*self._damage, *(f"{file.path}: {damage}" for file in self._files for damage in file.damage)]
+        return "; ".join(found) or None
+
+    @cached_property
+    def typestore(self) -> Typestore:
+        """The message types of this recording."""
+        return typestore_for(self.topics.values())
+
+    def messages(
+        self, topics: Collection[str] | None = None, start: int | None = None, stop: int | None = None
+    ) -> Iterator[RecordedMessage]:
+        """Give the messages of `topics` (all by default) with start <= log_time < stop (ns) by log time.
+
+        Memory stays flat: one chunk of each file that is being read. Raises RecordingError for an unknown topic.
+        """
+        wanted = set(self.topics if topics is None else topics)
+        if unknown := wanted - self.topics.keys():
+            raise RecordingError(f"{self.path}: no topic {sorted(unknown)}; it has {sorted(self.topics)}")
+        first, last = 0 if start is None else start, _FOREVER if stop is None else stop
+        return _decompressed(
+            in_time_order(
+                Source(file.start, partial(file.messages, wanted, first, last))
+                for file in self._files
+                if file.start is not None and file.end is not None and file.start < last and file.end >= first
+            )
+        )
+
+    def deserialize(self, message: RecordedMessage) -> Any:
+        """Return the message as an object whose attributes are those of rclpy's class; arrays are numpy arrays.
+
+        Raises RecordingError, naming topic, type and time, when the type is unknown or the bytes do not fit it.
+        """
+        type_ = self.topics[message.topic].type
+        where = f"{self.path}: {message.topic} at {message.log_time} ns"
+        if type_ not in self.typestore.fielddefs:
+            raise RecordingError(f"{where}: type {type_} is not known, and the recording carries no definition of it")
+        try:
+            return self.typestore.deserialize_cdr(message.cdr, type_)
+        except (SerdeError, ValueError) as error:
+            raise RecordingError(f"{where}: {len(message.cdr)} bytes that are no {type_}: {error}") from error
+
+    def _span(self) -> tuple[int, int]:
+        starts = [file.start for file in self._files if file.start is not None]
+        ends = [file.end for file in self._files if file.end is not None]
+        if not starts:
+            damage = f" ({self.damage})" if self.damage else ""
+            raise RecordingError(f"{self.path}: holds no readable message{damage}")
+        return min(starts), max(ends)
+
+    def _listed(self, path: Path) -> list[Path]:
+        """Return the storage files of a path: itself, or those of a folder."""
+        if not path.exists():
+            raise RecordingError(f"{path}: does not exist")
+        if path.is_file():
+            return [path]
+        present = sorted(file for file in path.iterdir() if file.name.endswith(_SUFFIXES))
+        files = self._listed_by_metadata(path) or present
+        if missing := [file.name for file in files if not file.exists()]:
+            self._damage.append(f"{path}: metadata.yaml lists {', '.join(missing)}, not found")
+        if not (files := [file for file in files if file.exists()]):
+            content = ", ".join(sorted(file.name for file in path.iterdir())[:8]) or "nothing"
+            raise RecordingError(f"{path}: no recording in this folder; found {content}")
+        return files
+
+    def _listed_by_metadata(self, folder: Path) -> list[Path]:
+        """Return what metadata.yaml lists, nothing when the recorder died before it wrote one."""
+        metadata = folder / "metadata.yaml"
+        if not metadata.exists():
+            self._damage.append(f"{folder}: no metadata.yaml, reading all files of the folder")
+            return []
+        try:
+            names = yaml.safe_load(metadata.read_text())["rosbag2_bagfile_information"]["relative_file_paths"]
+            return [folder / PurePath(name).name for name in names]
+        except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError) as error:
+            self._damage.append(f"{metadata}: unreadable ({type(error).__name__}), reading all files of the folder")
+            return []
+
+    def _open_files(self, paths: Sequence[Path]) -> list[RecordingFile]:
+        """Open the files; when one of several cannot be opened, the others are still read."""
+        files: list[RecordingFile] = []
+        errors: list[RecordingError] = []
+        for path in paths:
+            try:
+                files.append(self._open_file(path))
+            except RecordingError as error:
+                errors.append(error)
+        if not files:
+            raise RecordingError("; ".join(map(str, errors)))
+        self._damage += map(str, errors)
+        return files
+
+    def _open_file(self, path: Path) -> RecordingFile:
+        try:
+            with path.open("rb") as stream:
+                beginning = stream.read(16)
+            if beginning.startswith(_ZSTD_MAGIC):
+                return self._open_file(self._unpack(path))
+            for magic, reader in _READERS.items():
+                if beginning.startswith(magic):
+                    return reader(path)
+        except OSError as error:
+            raise RecordingError(f"{path}: {error.strerror or error}") from error
+        found = f"begins with {beginning!r}" if beginning else "is empty (0 bytes)"
+        raise RecordingError(f"{path}: {found}; an MCAP, SQLite or ROS 1 recording was expected")
+
+    def _unpack(self, path: Path) -> Path:
+        """Unpack a file that was compressed as a whole into a temporary folder."""
+        self._unpacked = self._unpacked or TemporaryDirectory(prefix="cvcdepth_")
+        target = Path(self._unpacked.name) / path.stem
+        try:
+            with zstandard.open(path, "rb") as packed, target.open("wb") as unpacked:
+                shutil.copyfileobj(packed, unpacked)
+        except zstandard.ZstdError as error:
+            raise RecordingError(f"{path}: cannot be decompressed: {error}") from error
+        return target
+
+
+def _decompressed(messages: Iterator[RecordedMessage]) -> Iterator[RecordedMessage]:
+    """Unpack messages that were compressed one by one; CDR begins with a zero byte, so they cannot be confused."""
+    for message in messages:
+        if message.cdr[:4] == _ZSTD_MAGIC:
+            yield message._replace(cdr=zstandard.decompress(message.cdr))
+        else:
+            yield message

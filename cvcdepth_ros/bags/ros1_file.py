@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reading of one ROS 1 .bag file; its messages are converted to CDR, its types to their ROS 2 form."""
+
+from collections.abc import Collection, Iterator
+from pathlib import Path
+
+from rosbags.interfaces import Connection, ConnectionExtRosbag1
+from rosbags.rosbag1 import Reader, ReaderError
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+
+from cvcdepth_core.errors import RecordingError
+from cvcdepth_ros.bags.topics import LATCHED, RecordedMessage, Topic, joined_topics
+from cvcdepth_ros.bags.typestores import typestore, typestore_for
+
+MAGIC = b"#ROSBAG V2.0\n"
+_HEADER = "std_msgs/msg/Header"  # has a sequence number in ROS 1 that ROS 2 dropped
+
+
+class Ros1File:
+    """One .bag file, see `RecordingFile`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.damage: list[str] = []
+        try:
+            with Reader(path) as reader:
+                self.topics = joined_topics([_topic(connection) for connection in reader.connections], path)
+                empty = reader.message_count == 0
+                self.start = None if empty else reader.start_time
+                self.end = None if empty else reader.end_time - 1
+        except ReaderError as error:
+            raise RecordingError(f"{path}: {error} (`rosbag reindex` repairs a bag that was cut)") from error
+        except TypesysError as error:
+            raise RecordingError(f"{path}: message definition not understood: {error}") from error
+        self._typestore = typestore_for(self.topics.values())
+
+    def messages(self, topics: Collection[str], start: int, stop: int) -> Iterator[RecordedMessage]:
+        """Give the messages of `topics` with start <= log_time < stop, in time order."""
+        count = 0
+        with Reader(self.path) as reader:
+            wanted = [connection for connection in reader.connections if connection.topic in topics]
+            try:
+                for connection, log_time, raw in reader.messages(wanted, start, stop) if wanted else ():
+                    cdr = self._typestore.ros1_to_cdr(raw, connection.msgtype)
+                    yield RecordedMessage(connection.topic, log_time, cdr)
+                    count += 1
+            except (ReaderError, SerdeError, OSError, EOFError, RuntimeError) as error:
+                self.damage.append(f"reading stopped after {count} messages ({error})")
+
+
+def _topic(connection: Connection) -> Topic:
+    types = get_types_from_msg(connection.msgdef.data, connection.msgtype)
+    types[_HEADER] = typestore().fielddefs[_HEADER]
+    types["builtin_interfaces/msg/Time"] = typestore().fielddefs["builtin_interfaces/msg/Time"]
+    types["builtin_interfaces/msg/Duration"] = typestore().fielddefs["builtin_interfaces/msg/Duration"]
+    store = get_typestore(Stores.EMPTY)
+    store.register(types)
+    definition, _ = store.generate_msgdef(connection.msgtype, ros_version=2)
+    latched = isinstance(connection.ext, ConnectionExtRosbag1) and bool(connection.ext.latching)
+    return Topic(connection.topic, connection.msgtype, connection.msgcount, (LATCHED,) if latched else None, definition)

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reading of one .db3 file (rosbag2's sqlite3 storage), also with the write-ahead log that a crash leaves beside it."""
+
+import sqlite3
+from collections.abc import Collection, Iterator
+from contextlib import closing
+from pathlib import Path
+from urllib.parse import quote
+
+from cvcdepth_core.errors import RecordingError
+from cvcdepth_ros.bags.topics import RecordedMessage, Topic, joined_topics, recorded_qos
+
+MAGIC = b"SQLite format 3\0"
+
+
+class SqliteFile:
+    """One .db3 file, see `RecordingFile`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.damage: list[str] = []
+        try:
+            with closing(self._connect()) as database:
+                self._names = self._readable_names(database)
+                self.topics = joined_topics([*self._read_topics(database)], path)
+                self.start, self.end = database.execute(
+                    "SELECT MIN(timestamp), MAX(timestamp) FROM messages"
+                ).fetchone()
+        except sqlite3.Error as error:
+            raise RecordingError(f"{path}: not readable as a rosbag2 database: {error}") from error
+
+    def messages(self, topics: Collection[str], start: int, stop: int) -> Iterator[RecordedMessage]:
+        """Give the messages of `topics` with start <= log_time < stop, in time order."""
+        wanted = {id_: name for id_, name in self._names.items() if name in topics}
+        query = (
+            "SELECT topic_id, timestamp, data FROM messages WHERE timestamp >= ? AND timestamp < ? "
+            f"AND topic_id IN ({', '.join('?' * len(wanted))}) ORDER BY timestamp, id"
+        )
+        count = 0
+        with closing(self._connect()) as database:
+            try:
+                for id_, log_time, cdr in database.execute(query, (start, stop, *wanted)):
+                    yield RecordedMessage(wanted[id_], log_time, cdr)
+                    count += 1
+            except sqlite3.DatabaseError as error:
+                self._report(f"reading stopped after {count} messages ({error})")
+
+    def _connect(self) -> sqlite3.Connection:
+        """Open without changing anything; `immutable` spares locks but would not look at a write-ahead log."""
+        log = self.path.with_name(self.path.name + "-wal")
+        immutable = "" if log.exists() and log.stat().st_size else "&immutable=1"
+        return sqlite3.connect(f"file:{quote(str(self.path.resolve()))}?mode=ro{immutable}", uri=True)
+
+    def _readable_names(self, database: sqlite3.Connection) -> dict[int, str]:
+        names = {}
+        for id_, name, encoding in database.execute("SELECT id, name, serialization_format FROM topics ORDER BY id"):
+            if encoding == "cdr":
+                names[id_] = name
+            else:
+                self._report(f"left out {name}: serialization format {encoding!r} is not cdr")
+        return names
+
+    def _read_topics(self, database: sqlite3.Connection) -> Iterator[Topic]:
+        counts = dict(database.execute("SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id"))
+        definitions = _definitions(database)
+        qos = "offered_qos_profiles" if "offered_qos_profiles" in _columns(database, "topics") else "NULL"
+        for id_, type_, profiles in database.execute(f"SELECT id, type, {qos} FROM topics ORDER BY id"):
+            if id_ in self._names:
+                yield Topic(self._names[id_], type_, counts.get(id_, 0), recorded_qos(profiles), definitions.get(type_))
+
+    def _report(self, damage: str) -> None:
+        if damage not in self.damage:
+            self.damage.append(damage)
+
+
+def _definitions(database: sqlite3.Connection) -> dict[str, str]:
+    """Return the definitions by type; recordings older than Iron have none."""
+    if not _columns(database, "message_definitions"):
+        return {}
+    rows = database.execute("SELECT topic_type, encoded_message_definition FROM message_definitions")
+    return {type_: definition for type_, definition in rows if definition}
+
+
+def _columns(database: sqlite3.Connection, table: str) -> set[str]:
+    return {row[1] for row in database.execute(f"PRAGMA table_info({table})")}

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every recording format has in common: topics, messages, and the protocol of a reader of one file."""
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.rosbag2 import ReaderError
+from rosbags.rosbag2.metadata import parse_qos
+
+from cvcdepth_core.errors import RecordingError
+
+
+class RecordedMessage(NamedTuple):
+    """One message as it was recorded."""
+
+    topic: str
+    log_time: int
+    """When it was recorded, ns since the epoch."""
+    cdr: bytes | memoryview
+    """The serialised message with its four-byte encapsulation header, whatever format the recording has."""
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One topic of a recording."""
+
+    name: str
+    type: str
+    """Message type as ROS 2 writes it: `sensor_msgs/msg/Image`."""
+    count: int
+    """Number of messages that can be read."""
+    qos: tuple[Qos, ...] | None = None
+    """The profiles its publishers offered, or None where the recording does not say."""
+    definition: str | None = None
+    """The message definition (.msg or IDL text, with those it refers to), or None where the recording has none."""
+
+    def joined(self, other: "Topic", where: Path) -> "Topic":
+        """Return this topic with the messages of another channel or file of the same recording added.
+
+        Raises RecordingError, naming `where`, when the two have different message types.
+        """
+        if self.type != other.type:
+            raise RecordingError(f"{where}: topic {self.name} has two types, {self.type} and {other.type}")
+        profiles = dict.fromkeys((self.qos or ()) + (other.qos or ()))
+        return replace(
+            self,
+            count=self.count + other.count,
+            qos=tuple(profiles) or None,
+            definition=self.definition or other.definition,
+        )
+
+
+class RecordingFile(Protocol):
+    """A reader of one file. It keeps no file open between calls, so a recording may have any number of files."""
+
+    path: Path
+    topics: dict[str, Topic]
+    start: int | None
+    """Log time of the first message, ns; None when the file holds no message."""
+    end: int | None
+    """Log time of the last message, ns."""
+    damage: list[str]
+    """What could not be read; grows while messages are read."""
+
+    def messages(self, topics: Collection[str], start: int, stop: int) -> Iterator[RecordedMessage]:
+        """Give the messages of `topics` with start <= log_time < stop, in time order."""
+        ...
+
+
+def joined_topics(topics: Collection[Topic], where: Path) -> dict[str, Topic]:
+    """Return the topics by name, those that appear more than once joined into one."""
+    by_name: dict[str, Topic] = {}
+    for topic in topics:
+        known = by_name.get(topic.name)
+        by_name[topic.name] = known.joined(topic, where) if known else topic
+    return by_name
+
+
+def recorded_qos(text: str | None) -> tuple[Qos, ...] | None:
+    """Return the profiles of an `offered_qos_profiles` entry (YAML), None when it is absent, empty or unreadable."""
+    try:
+        return tuple(parse_qos(text or "")) or None
+    except (ReaderError, KeyError, TypeError, AttributeError):
+        return None
+
+
+def qos_profile(
+    depth: int = 10,
+    reliability: QosReliability = QosReliability.RELIABLE,
+    durability: QosDurability = QosDurability.VOLATILE,
+) -> Qos:
+    """Return a keep-last profile without deadline or lifespan."""
+    unlimited = QosTime(0, 0)
+    liveliness = QosLiveliness.AUTOMATIC
+    return Qos(QosHistory.KEEP_LAST, depth, reliability, durability, unlimited, unlimited, liveliness, unlimited, False)
+
+
+LATCHED = qos_profile(depth=1, durability=QosDurability.TRANSIENT_LOCAL)
+"""What /tf_static is published with: whoever subscribes later still gets it."""
