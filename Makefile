@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+# Everything is installed into .venv and .venv-core, in the versions of requirements/*.lock; nothing outside this folder.
+
+PYTHON ?= python3
+# Not in the locks, because pip's index decides whether it is a CPU or a CUDA build.
+TORCH ?= torch==2.13.0
+
+# A stamp's name carries the content that was installed: a changed lock is installed again, an unchanged one never.
+key = $(shell { echo "$(TORCH)"; cat requirements/$(1).lock setup.py; } | sha256sum | cut -c1-12)
+DEMO := .venv/installed/demo-$(call key,demo)
+DEV := .venv/installed/dev-$(call key,dev)
+CORE := .venv-core/installed/core_test-$(call key,core_test)
+
+# A sourced ROS 2 installation must not leak into the wheels' environment, and nothing here talks to other machines.
+unexport PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH CMAKE_PREFIX_PATH LD_LIBRARY_PATH RMW_IMPLEMENTATION ROS_DISTRO
+export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.NOTPARALLEL:
+.DELETE_ON_ERROR:
+.PHONY: help demo test lint test-ros test-core tf2_msgs lock clean
+
+help: ## list the targets
+	@sed -n 's/^\([a-z0-9_-]*\):.* ## /\1\t/p' Makefile | expand -t 12
+
+demo: $(DEMO) ## play the sample recording to the live node over DDS; pictures and a table in output/demo
+	.venv/bin/python -m cvcdepth_ros.demo --output output/demo
+
+test: lint test-ros test-core ## everything that CI runs
+
+lint: $(DEV) ## ruff and mypy
+	.venv/bin/ruff check .
+	.venv/bin/ruff format --check .
+	.venv/bin/mypy
+
+test-ros: $(DEV) tf2_msgs ## the tests, with ROS 2 from wheels
+	.venv/bin/python -m pytest
+
+test-core: $(CORE) ## the tests that need no ROS, where there is none
+	@if .venv-core/bin/python -c 'import rclpy' 2>/dev/null; then echo "rclpy is in .venv-core: make clean"; exit 1; fi
+	.venv-core/bin/python -m pytest
+
+tf2_msgs: $(DEV) ## build tf2_msgs, which has no wheel, for the tests of /tf_static (needs g++)
+	@.venv/bin/python tests/tf2_msgs/build.py
+
+lock: .venv-lock/bin/uv ## resolve requirements/*.in again (LOCK=--upgrade for newer versions)
+	$(call compile,dev) $(LOCK)
+	$(call compile,demo) --constraints requirements/dev.lock
+	$(call compile,core_test) --constraints requirements/dev.lock
+
+clean: ## remove all that was installed, built or written by make
+	rm -rf .venv .venv-core .venv-lock build install log dist output/demo *.egg-info .mypy_cache .pytest_cache .ruff_cache
+
+compile = .venv-lock/bin/uv pip compile --quiet --universal --python-version 3.10 --no-annotate \
+	--custom-compile-command "make lock" requirements/$(1).in --output-file requirements/$(1).lock
+
+# Wheels only, so that no compiler is ever needed; empy, pure Python, is published as source alone.
+# pip shows its progress for torch, by far the largest download, and is quiet for the rest.
+define install
+@echo "Installing requirements/$(2).lock into $(1), once: about a minute, longer on a slow connection."
+@$(1)/bin/pip install --only-binary :all: --constraint requirements/$(2).lock "$(TORCH)"
+@$(1)/bin/pip install -qq --only-binary :all: --no-binary empy --requirement requirements/$(2).lock
+@$(1)/bin/pip install -qq --no-deps --no-build-isolation --editable .
+@mkdir -p $(1)/installed && touch $@
+endef
+
+$(DEMO): .venv/bin/python
+	$(call install,.venv,demo)
+
+$(DEV): .venv/bin/python
+	$(call install,.venv,dev)
+
+$(CORE): .venv-core/bin/python
+	$(call install,.venv-core,core_test)
+
+%/bin/python:
+	@$(PYTHON) tools/check_machine.py
+	@$(PYTHON) -m venv --clear $*
+
+.venv-lock/bin/uv: .venv-lock/bin/python
+	@.venv-lock/bin/pip install -qq uv==0.13.9

@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the files that are not Python lie: configuration, rigs, launch files."""
+
+from pathlib import Path
+
+from cvcdepth_core.errors import ConfigError
+
+PACKAGE = "cvcdepth_ros"
+
+
+def share_directory() -> Path:
+    """Find the folder that holds `config/` and `launch/`, for the very installation that is running.
+
+    It is looked for upwards from this file, so that no environment variable can lead to another version's files: the
+    source tree (an editable installation) holds `package.xml` and `config`; colcon and pip put them into
+    `share/cvcdepth_ros` of the prefix that the code is installed in.
+
+    Raises:
+        ConfigError: neither is there; the message names the folders that were tried.
+
+    """
+    above = Path(__file__).absolute().parents[1:]
+    candidates = [folder for parent in above for folder in (parent, parent / "share" / PACKAGE)]
+    for folder in candidates:
+        if (folder / "package.xml").is_file() and (folder / "config").is_dir():
+            return folder
+    tried = ", ".join(str(folder) for folder in candidates)
+    raise ConfigError(f"the files of {PACKAGE} are not installed: no folder with package.xml and config among {tried}")
