@@ -35,8 +35,8 @@ def pixel_rays(intrinsics: NDArray[np.float64], height: int, width: int) -> NDAr
 def pack_rgb(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Pack RGB [..., 3] into float32 [...] whose bits are 0x00RRGGBB, the `rgb` field that RViz and PCL read."""
     channels = picture.astype(np.uint32)
-    packed: NDArray[np.uint32] = channels[..., 0] << 16 | channels[..., 1] << 8 | channels[..., 2]
-    return packed.view(np.float32)
+    packed = channels[..., 0] * 0x10000 + channels[..., 1] * 0x100 + channels[..., 2]
+    return packed.astype(np.uint32, copy=False).view(np.float32)
 
 
 def organised_cloud(surround: SurroundDepth, camera: int) -> Cloud:

@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Complete a rig file with what a recording or a live system says: CameraInfo and static transforms."""
+
+from typing import Any
+
+from cvcdepth_core.calibration import Calibration
+from cvcdepth_core.errors import RigError, TransformError
+from cvcdepth_core.rig import CameraEntry, PoseEntry, Rig, RigLayout, order_around_vehicle
+from cvcdepth_ros.messages import calibration_from_message
+from cvcdepth_ros.transforms import TransformTree
+
+
+class RigAssembler:
+    """Collects calibrations and transforms until a layout's cameras are complete.
+
+    `transforms` is the tree of static transforms; whoever receives them adds them there.
+    """
+
+    def __init__(self, layout: RigLayout) -> None:
+        self.layout = layout
+        self.transforms = TransformTree()
+        self._calibrations: dict[str, Calibration] = {}
+        self._frame_ids: dict[str, str] = {}
+        self._refused: dict[str, str] = {}
+
+    def add_camera_info(self, camera: str, message: Any) -> bool:
+        """Take over a camera's CameraInfo; return whether it says anything new.
+
+        An impossible one is not raised but remembered as the camera's problem, and replaces what was known before:
+        a camera that calls itself uncalibrated must not be used with yesterday's numbers.
+        """
+        self._frame_ids[camera] = message.header.frame_id
+        try:
+            calibration = calibration_from_message(message, camera)
+        except RigError as error:
+            self._calibrations.pop(camera, None)
+            is_new = self._refused.get(camera) != str(error)
+            self._refused[camera] = str(error)
+            return is_new
+        self._refused.pop(camera, None)
+        is_new = self._calibrations.get(camera) != calibration
+        self._calibrations[camera] = calibration
+        return is_new
+
+    def frame_id(self, camera: str) -> str | None:
+        """Return the camera's optical frame: the rig file's, else CameraInfo's, None while neither is known."""
+        return self._entry(camera).frame_id or self._frame_ids.get(camera)
+
+    def problems(self) -> dict[str, str]:
+        """Say for each camera that is not complete what it lacks; empty when the rig can be built."""
+        found = ((camera.name, self._problem(camera)) for camera in self.layout.cameras)
+        return {name: problem for name, problem in found if problem is not None}
+
+    def rig(self) -> Rig:
+        """Build the rig. RigError or TransformError names the first camera that lacks something."""
+        for problem in self.problems().values():
+            raise RigError(problem)
+        poses = {c.name: self._lookup(c) for c in self.layout.cameras if c.base_T_camera is None}
+        return self.layout.complete(self._calibrations, poses)
+
+    def completed_layout(self) -> RigLayout:
+        """Return the layout with everything that was collected filled in, its cameras ordered around the vehicle."""
+        rig = self.rig()
+        poses = {camera.name: camera.base_T_camera for camera in rig.cameras}
+        entries = {
+            camera.name: self._entry(camera.name).model_copy(
+                update={
+                    "frame_id": self.frame_id(camera.name),
+                    "calibration": camera.calibration,
+                    "base_T_camera": PoseEntry.from_matrix(camera.base_T_camera),
+                }
+            )
+            for camera in rig.cameras
+        }
+        ordered = tuple(entries[name] for name in order_around_vehicle(poses))
+        return self.layout.model_copy(update={"cameras": ordered})
+
+    def _entry(self, camera: str) -> CameraEntry:
+        return next(entry for entry in self.layout.cameras if entry.name == camera)
+
+    def _lookup(self, entry: CameraEntry) -> Any:
+        return self.transforms.lookup(self.layout.base_frame, self.frame_id(entry.name) or "")
+
+    def _problem(self, entry: CameraEntry) -> str | None:
+        if entry.name in self._refused and entry.calibration is None:
+            return self._refused[entry.name]
+        if entry.calibration is None and entry.name not in self._calibrations:
+            return f"camera {entry.name}: waiting for camera_info on {entry.camera_info_topic}"
+        if self.frame_id(entry.name) is None:
+            return f"camera {entry.name}: no frame_id in the rig file, waiting for {entry.camera_info_topic}"
+        if entry.base_T_camera is None:
+            try:
+                self._lookup(entry)
+            except TransformError as error:
+                return f"camera {entry.name}: {error}"
+        return None
