@@ -7,7 +7,7 @@ point c to (c + 0.5) s - 0.5.
 
 import math
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,6 +68,14 @@ class Calibration(BaseModel):
     """Sensor rows per image row."""
     roi: RegionOfInterest = RegionOfInterest()
     """The part of the sensor that the image shows."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _name_the_model_of_no_distortion(cls, fields: Any) -> Any:
+        # Converters of rectified datasets name no model and give no coefficients: then there is nothing to misread.
+        if isinstance(fields, dict) and fields.get("distortion_model") == "" and not fields.get("d"):
+            return fields | {"distortion_model": "plumb_bob"}
+        return fields
 
     @model_validator(mode="after")
     def _check(self) -> "Calibration":
@@ -141,7 +149,9 @@ def first_validation_message(error: ValueError) -> str:
     message = str(first["msg"]).removeprefix("Value error, ")
     if not where:
         return message
-    return f"{where}: {message}, found {first['input']!r:.80}" if first["type"] != "missing" else f"{where}: {message}"
+    # Our own checks say the value themselves, and a missing field has none.
+    says_all = first["type"] in ("missing", "value_error")
+    return f"{where}: {message}" if says_all else f"{where}: {message}, found {first['input']!r:.80}"
 
 
 def _first_problem(calibration: Calibration) -> str | None:
@@ -149,15 +159,13 @@ def _first_problem(calibration: Calibration) -> str | None:
     c = calibration
     counts = _COEFFICIENT_COUNTS[c.distortion_model]
     lengths = {"k": (len(c.k), 9), "r": (len(c.r), 9), "p": (len(c.p), 12)}
+    numbers = {"k": c.k, "d": c.d, "r": c.r, "p": c.p}
     checks = [
         (c.width <= 0 or c.height <= 0, f"size {c.width}x{c.height}: the camera has no pixels"),
         *((found != want, f"{name} has {found} numbers, want {want}") for name, (found, want) in lengths.items()),
-        (not _finite((*c.k, *c.r, *c.p, *c.d)), f"not finite: k {c.k}, d {c.d}, r {c.r}, p {c.p}"),
+        *((not all(map(math.isfinite, row)), f"{name} = {row} is not finite") for name, row in numbers.items()),
         (bool(c.k) and c.k[0] == 0.0, "K[0] = 0: the camera is not calibrated"),
-        (
-            len(c.d) not in counts,
-            f"{c.distortion_model} takes {' or '.join(map(str, counts))} numbers in d, found {len(c.d)}",
-        ),
+        (len(c.d) not in counts, f"{c.distortion_model} takes {_alternatives(counts)} numbers in d, found {len(c.d)}"),
         (c.binning_x < 1 or c.binning_y < 1, f"binning {c.binning_x} x {c.binning_y}: want 1 or more"),
     ]
     basic = next((message for wrong, message in checks if wrong), None)
@@ -169,20 +177,19 @@ def _matrix_problem(c: Calibration) -> str | None:
         return f"K = {c.k} is not a camera matrix: want fx > 0, fy > 0 and 1 in the corner"
     if any(c.p) and not (c.p[0] > 0 and c.p[5] > 0 and c.p[10] == 1.0):
         return f"P = {c.p} is not a projection matrix: want fx > 0, fy > 0 and 1 in the corner"
-    R = np.array(c.r).reshape(3, 3)
-    return None if np.allclose(R @ R.T, np.eye(3), atol=1e-3) else f"R = {c.r} is not a rotation"
+    R = c.rotation
+    is_rotation = np.allclose(R @ R.T, np.eye(3), atol=1e-3) and np.linalg.det(R) > 0
+    return None if is_rotation else f"R = {c.r} is not a rotation"
 
 
 def _region_problem(c: Calibration) -> str | None:
-    right, bottom = c.roi.x_offset + c.roi.width, c.roi.y_offset + c.roi.height
+    right, bottom = c.roi.x_offset + (c.roi.width or c.width), c.roi.y_offset + (c.roi.height or c.height)
     if min(c.roi.x_offset, c.roi.y_offset, c.roi.width, c.roi.height) < 0 or right > c.width or bottom > c.height:
         return f"region of interest {c.roi.model_dump()} is not inside the sensor's {c.width}x{c.height}"
+    if 0 in c.image_size:
+        return f"binning {c.binning_x} x {c.binning_y} leaves an image of {c.image_size[0]}x{c.image_size[1]}"
     return None
 
 
 def _alternatives(counts: Sequence[int]) -> str:
     return " or ".join(map(str, counts))
-
-
-def _finite(numbers: Sequence[float]) -> bool:
-    return all(math.isfinite(number) for number in numbers)

@@ -21,7 +21,7 @@ def pose_from_quaternion(translation: Sequence[float], rotation: Sequence[float]
     farther than 1e-3 from 1; within that it is normalised.
     """
     values = np.array([*translation, *rotation], dtype=np.float64)
-    if values.shape != (7,) or not np.isfinite(values).all():
+    if (len(translation), len(rotation)) != (3, 4) or not np.isfinite(values).all():
         raise TransformError(
             f"{name}: translation {list(translation)}, rotation {list(rotation)}: want 3 + 4 finite numbers"
         )

@@ -6,7 +6,8 @@ A `RigLayout` is what a YAML file holds. It may leave calibrations and transform
 """
 
 import math
-from collections.abc import Mapping
+import os
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,13 +18,14 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from cvcdepth_core.calibration import Calibration, first_validation_message
-from cvcdepth_core.errors import RigError
+from cvcdepth_core.errors import RigError, TransformError
 from cvcdepth_core.poses import Pose, check_rigid, pose_from_quaternion, quaternion_from_rotation
 
 MIN_NEIGHBOUR_OVERLAP_DEG = 2.0
 """Cameras whose images share a narrower strip than this are no neighbours: its pixels are too few to learn from."""
 
-_OVERLAP_GRID = (72, 128)
+# What a ROS topic takes between two slashes, since output topics carry the camera's name.
+_TOPIC_PART = r"^[A-Za-z][A-Za-z0-9_]*$"
 
 
 class PoseEntry(BaseModel):
@@ -35,6 +37,18 @@ class PoseEntry(BaseModel):
     """x, y, z in metres."""
     rotation: tuple[float, float, float, float]
     """Unit quaternion x, y, z, w."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "PoseEntry":
+        try:
+            self.matrix("pose")
+        except TransformError as error:
+            raise ValueError(error) from error
+        return self
+
+    def matrix(self, name: str) -> Pose:
+        """Return it as a 4x4 matrix; `name` is what errors call it."""
+        return pose_from_quaternion(self.translation, self.rotation, name)
 
     @classmethod
     def from_matrix(cls, pose: Pose) -> "PoseEntry":
@@ -49,17 +63,17 @@ class CameraEntry(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
-    name: str = Field(min_length=1)
-    """The camera's name, unique in the rig; output topics carry it."""
-    image_topic: str
+    name: str = Field(pattern=_TOPIC_PART)
+    """The camera's name, unique in the rig; output topics carry it, hence letters, digits and underscores only."""
+    image_topic: str = Field(min_length=1)
     """Topic of its images (`sensor_msgs/Image` or `CompressedImage`)."""
-    camera_info_topic: str
+    camera_info_topic: str = Field(min_length=1)
     """Topic of its `sensor_msgs/CameraInfo`."""
     frame_id: str | None = None
     """Its optical frame (REP 103: z forward, x right, y down); without it, the frame that CameraInfo names."""
     rectified: bool = False
     """Whether the topic carries rectified images (`image_rect`): then P describes them and D is not used."""
-    stamp_offset: float = 0.0
+    stamp_offset: float = Field(default=0.0, allow_inf_nan=False)
     """Seconds by which its stamps are later than the anchor's for simultaneous exposures."""
     mask: Path | None = None
     """PNG of the image's size, 0 where the vehicle itself is in view, 255 elsewhere; relative to the rig file."""
@@ -94,9 +108,13 @@ class RigLayout(BaseModel):
         if self.anchor is not None and self.anchor not in names:
             raise ValueError(f"anchor: no camera is called {self.anchor}; there are {', '.join(names)}")
         for camera in self.cameras:
-            unknown = set(camera.neighbours or ()) - (set(names) - {camera.name})
+            others = set(names) - {camera.name}
+            given = camera.neighbours or ()
+            unknown = [neighbour for neighbour in given if neighbour not in others]
             if unknown:
                 raise ValueError(f"camera {camera.name}: neighbours: no other camera is called {', '.join(unknown)}")
+            if len(set(given)) < len(given):
+                raise ValueError(f"camera {camera.name}: neighbours: {', '.join(given)} names one twice")
         return self
 
     @property
@@ -117,7 +135,16 @@ class RigLayout(BaseModel):
         Both arguments are keyed by camera name. RigError names the first camera that lacks a calibration or transform.
         """
         return Rig(
-            cameras=tuple(_complete_camera(entry, calibrations or {}, base_T_cameras or {}) for entry in self.cameras),
+            cameras=tuple(
+                Camera(
+                    entry.name,
+                    _calibration_of(entry, calibrations or {}),
+                    _pose_of(entry, base_T_cameras or {}, self.base_frame),
+                    entry.rectified,
+                    entry.mask,
+                )
+                for entry in self.cameras
+            ),
             base_frame=self.base_frame,
             anchor=self.anchor_camera,
             given_neighbours={c.name: c.neighbours for c in self.cameras if c.neighbours is not None},
@@ -170,9 +197,12 @@ class Rig:
 
     @cached_property
     def neighbours(self) -> dict[str, list[str]]:
-        """For each camera the cameras that share its view: those the rig file gives, else those that overlap enough."""
-        wide = [o for o in self.overlaps if o.angle >= MIN_NEIGHBOUR_OVERLAP_DEG]
-        computed = {name: [o.neighbour for o in wide if o.camera == name] for name in self.names}
+        """For each camera the cameras that share its view: those the rig file gives, else those that overlap enough.
+
+        Computed neighbours are mutual: a strip that is wide enough in one of two cameras makes both neighbours.
+        """
+        wide = {frozenset((o.camera, o.neighbour)) for o in self.overlaps if o.angle >= MIN_NEIGHBOUR_OVERLAP_DEG}
+        computed = {name: [other for other in self.names if frozenset((name, other)) in wide] for name in self.names}
         return {name: list(self.given_neighbours.get(name, computed[name])) for name in self.names}
 
     @property
@@ -185,31 +215,46 @@ class Rig:
 def overlap_angle(camera: Camera, neighbour: Camera) -> float:
     """Return the width, in degrees, of the strip of `camera`'s rectified image whose directions `neighbour` sees too.
 
-    Directions are those of far points: the distance between the cameras is left out.
+    Directions are those of far points: the distance between the cameras is left out. The width is measured along the
+    image axis that is nearer to the horizontal, so that a camera mounted on its side counts like any other.
     """
-    rays = _image_rays(camera)
-    neighbour_R_camera = neighbour.base_T_camera[:3, :3].T @ camera.base_T_camera[:3, :3]
-    x, y, z = neighbour_R_camera @ rays
-    width, height = neighbour.calibration.image_size
-    K = neighbour.calibration.rectified_intrinsics
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u, v = K[0, 0] * x / z + K[0, 1] * y / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
-    seen = (z > 0) & (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
-    if not seen.any():
+    shared = _image_outline(camera)
+    camera_R_neighbour = camera.base_T_camera[:3, :3].T @ neighbour.base_T_camera[:3, :3]
+    for inward in (camera_R_neighbour @ _image_sides(neighbour).T).T:
+        shared = _clip(shared, inward)
+    if not len(shared):
         return 0.0
-    azimuth = np.degrees(np.arctan2(rays[0, seen], rays[2, seen]))
-    return float(np.ptp(azimuth))
+    up = camera.base_T_camera[2, :3]
+    horizontal = 0 if abs(up[1]) >= abs(up[0]) else 1
+    return float(np.ptp(np.degrees(np.arctan2(shared[:, horizontal], shared[:, 2]))))
 
 
-def _image_rays(camera: Camera) -> NDArray[np.float64]:
-    """Rays [3, n] (z = 1) through a coarse grid over the rectified image, its outer edges included."""
+def _image_outline(camera: Camera) -> NDArray[np.float64]:
+    """Rays [4, 3] (z = 1) through the rectified image's outer corners, in order around it."""
     width, height = camera.calibration.image_size
-    u, v = np.meshgrid(
-        np.linspace(-0.5, width - 0.5, _OVERLAP_GRID[1]), np.linspace(-0.5, height - 0.5, _OVERLAP_GRID[0])
-    )
-    pixels = np.stack([u.ravel(), v.ravel(), np.ones(u.size)])
-    rays: NDArray[np.float64] = np.linalg.inv(camera.calibration.rectified_intrinsics) @ pixels
+    left, top, right, bottom = -0.5, -0.5, width - 0.5, height - 0.5
+    corners = np.array([[left, top, 1], [right, top, 1], [right, bottom, 1], [left, bottom, 1]])
+    rays: NDArray[np.float64] = corners @ np.linalg.inv(camera.calibration.rectified_intrinsics).T
     return rays
+
+
+def _image_sides(camera: Camera) -> NDArray[np.float64]:
+    """Return the normals [4, 3] of the planes through the optical centre and the image's sides; they point into the view."""
+    corners = _image_outline(camera)
+    return np.cross(corners, np.roll(corners, -1, axis=0))
+
+
+def _clip(outline: NDArray[np.float64], inward: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Cut a convex outline of rays [n, 3] (z = 1) at the plane with the normal `inward` (Sutherland-Hodgman 1974)."""
+    heights = outline @ inward
+    kept: list[NDArray[np.float64]] = []
+    for i in range(len(outline)):
+        j = (i + 1) % len(outline)
+        if heights[i] >= 0:
+            kept.append(outline[i])
+        if heights[i] * heights[j] < 0:
+            kept.append(outline[i] + (outline[j] - outline[i]) * heights[i] / (heights[i] - heights[j]))
+    return np.array(kept).reshape(-1, 3)
 
 
 def order_around_vehicle(base_T_cameras: Mapping[str, Pose]) -> list[str]:
@@ -231,36 +276,35 @@ def load_rig_layout(path: Path) -> RigLayout:
         layout = RigLayout.model_validate(content)
     except ValidationError as error:
         raise RigError(f"rig file {path}: {first_validation_message(error)}") from error
-    return _with_masks_beside(path, layout)
+    return _with_masks(layout, lambda mask: path.parent / mask)
 
 
 def save_rig_layout(path: Path, layout: RigLayout, comment: str = "") -> None:
-    """Write a rig file, `comment` first; a mask's path is written as it stands."""
+    """Write a rig file, `comment` first, masks relative to it; `load_rig_layout` gives the same layout back."""
     header = "".join(f"# {line}\n" for line in comment.splitlines())
-    content = layout.model_dump(mode="json", exclude_defaults=True)
+    relative = _with_masks(layout, lambda mask: Path(os.path.relpath(mask, path.parent)))
+    content = relative.model_dump(mode="json", exclude_defaults=True)
     path.write_text(header + yaml.safe_dump(content, sort_keys=False, default_flow_style=None), encoding="utf-8")
 
 
-def _complete_camera(
-    entry: CameraEntry, calibrations: Mapping[str, Calibration], base_T_cameras: Mapping[str, Pose]
-) -> Camera:
+def _calibration_of(entry: CameraEntry, calibrations: Mapping[str, Calibration]) -> Calibration:
     calibration = entry.calibration or calibrations.get(entry.name)
     if calibration is None:
         raise RigError(f"camera {entry.name}: no calibration in the rig file nor on {entry.camera_info_topic}")
+    return calibration
+
+
+def _pose_of(entry: CameraEntry, base_T_cameras: Mapping[str, Pose], base_frame: str) -> Pose:
     if entry.base_T_camera is not None:
-        pose = entry.base_T_camera
-        base_T_camera = pose_from_quaternion(pose.translation, pose.rotation, f"camera {entry.name}: base_T_camera")
-    elif entry.name in base_T_cameras:
-        base_T_camera = base_T_cameras[entry.name]
-    else:
-        raise RigError(f"camera {entry.name}: no transform to its frame {entry.frame_id or '(unknown)'}")
-    return Camera(entry.name, calibration, base_T_camera, entry.rectified, entry.mask)
+        return entry.base_T_camera.matrix(f"camera {entry.name}: base_T_camera")
+    if entry.name not in base_T_cameras:
+        frame = entry.frame_id or "its optical frame"
+        raise TransformError(f"camera {entry.name}: no transform from {frame} to {base_frame}")
+    return base_T_cameras[entry.name]
 
 
-def _with_masks_beside(path: Path, layout: RigLayout) -> RigLayout:
-    """Resolve mask paths, which a rig file gives relative to itself."""
+def _with_masks(layout: RigLayout, move: Callable[[Path], Path]) -> RigLayout:
     cameras = tuple(
-        camera.model_copy(update={"mask": path.parent / camera.mask}) if camera.mask else camera
-        for camera in layout.cameras
+        camera.model_copy(update={"mask": move(camera.mask)}) if camera.mask else camera for camera in layout.cameras
     )
     return layout.model_copy(update={"cameras": cameras})
