@@ -1,0 +1,315 @@
+# SPDX-License-Identifier: Apache-2.0
+"""N camera streams in, surround sets out: one image of every camera around each image of the anchor camera.
+
+The cameras of a real rig do not fire together; those of the PandaSet sample spread one set over 81 of the 100 ms of a
+period. All comparisons use corrected stamps: the image's stamp minus its camera's offset. No ROS here.
+
+**Which images.** Anchor images are decided one at a time, oldest first. Of every other camera comes the queued image
+nearest to the anchor image, with two refinements:
+
+* An image later than the anchor counts its distance 1.25 times. A camera that fires half a period away from the anchor
+  (PandaSet's back camera does) has two images equally near, and jitter would choose between them anew for every set;
+  this prefers the earlier, with which the set also leaves sooner.
+* An image that is nearer to the *next* anchor image is left to that one. Otherwise a start in mid cycle, or one lost
+  image, would pair a camera with its next cycle for ever.
+
+If every camera has such an image and no two stamps differ by more than the tolerance, the set is emitted, and images
+older than those used are dropped. If not, the anchor image is dropped and the others stay for the next one.
+
+**When.** As soon as waiting cannot bring a nearer image: every camera has sent one at or after the anchor's stamp, or
+its period (median of the last intervals) says that its next will not be nearer than the best one queued. Likewise an
+image that seems nearer to the next anchor image, as the anchor's period predicts it, waits for that one. Until a period
+is known (two images) the decision waits for the next image instead, so only the first set after a start comes late.
+
+**Faults.** Images may come late or out of order as long as nothing at or after their stamp has left their camera's
+queue. A camera's clock has stepped back (a recording that loops, NTP) when an image is older than its newest by more
+than `clock_jump`, or when three images in a row ascend behind the newest; then that camera's queue, and only that,
+starts anew. After a step forward the old anchor images find every camera beyond them and are decided at once. Every
+queue is bounded: a dead camera only means that the others drop their oldest image. Every image is counted as matched,
+queued or dropped for a reason.
+
+Choose an anchor that is not faster than the other cameras. Sets come in strictly increasing anchor time, and every
+camera's images too, except across a clock step, `reset` or `flush`.
+"""
+
+import math
+import threading
+from bisect import insort
+from collections import Counter, deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+from cvcdepth_core.errors import ConfigError
+
+T = TypeVar("T")
+
+NANOSECONDS = 1_000_000_000
+_INTERVALS_FOR_PERIOD = 9
+_BEHIND_IN_A_ROW = 3
+
+
+@dataclass(frozen=True)
+class SurroundSet(Generic[T]):
+    """One image of every camera, in the synchroniser's camera order."""
+
+    sequence: int  # counts the sets of one synchroniser from 0
+    stamp_ns: int  # the anchor image's own stamp: the stamp of everything computed from the set
+    stamps_ns: dict[str, int]  # each image's own stamp, its camera's offset not subtracted
+    images: dict[str, T]
+    spread_ns: int  # latest minus earliest corrected stamp
+
+
+@dataclass(frozen=True)
+class CameraStatistics:
+    """What became of one camera's images: received = matched + queued + the sum of dropped."""
+
+    received: int
+    matched: int
+    queued: int
+    # reason -> images: unmatched (passed over), duplicate_stamp, out_of_order (too late to be used), queue_full,
+    # clock_jump (queued when the clock stepped back), reset
+    dropped: dict[str, int]
+    clock_steps: int  # how often the stamps stepped back
+    period_ns: int | None  # None until two images have come
+
+
+@dataclass(frozen=True)
+class SynchronizerStatistics:
+    """A snapshot of all counters since construction."""
+
+    sets: int
+    cameras: dict[str, CameraStatistics]
+
+
+class SurroundSynchronizer(Generic[T]):
+    """Matches images of several cameras into surround sets; see the module's text for the rule. Thread-safe.
+
+    No caller's code runs under the lock: `add` returns the sets, and the caller hands them on.
+    """
+
+    def __init__(
+        self,
+        cameras: Sequence[str],
+        anchor: str,
+        tolerance: float,  # s, largest difference between any two corrected stamps of a set
+        offsets: Mapping[str, float] | None = None,  # s, camera -> subtracted from its stamps; 0 where not given
+        queue_size: int = 10,  # images per camera
+        clock_jump: float = 1.0,  # s, a stamp this much behind its camera's newest is a clock step
+    ) -> None:
+        """Raise ConfigError, naming the field, for a value out of range or an unknown camera."""
+        _check_cameras(cameras, anchor, offsets or {})
+        if isinstance(queue_size, bool) or not isinstance(queue_size, int) or queue_size < 2:
+            raise ConfigError(f"queue_size: expected a whole number of at least 2 images, found {queue_size!r}")
+        self._tolerance = _to_nanoseconds("tolerance", tolerance, minimum=0.0)
+        clock_jump_ns = _to_nanoseconds("clock_jump", clock_jump, minimum=tolerance)
+        self._streams: dict[str, _Stream[T]] = {}
+        for camera in cameras:
+            offset = _to_nanoseconds(f"offsets[{camera!r}]", (offsets or {}).get(camera, 0.0))
+            self._streams[camera] = _Stream(offset, queue_size, clock_jump_ns)
+        self._anchor = self._streams[anchor]
+        self._sets = 0
+        self._lock = threading.Lock()
+
+    def add(self, camera: str, stamp_ns: int, image: T) -> list[SurroundSet[T]]:
+        """Queue one image and return the sets that it completes, oldest first: mostly none or one.
+
+        Raises ConfigError if the camera is not one of the constructor's.
+        """
+        stream = self._streams.get(camera)
+        if stream is None:
+            raise ConfigError(f"camera: {camera!r} is not one of {', '.join(self._streams)}")
+        with self._lock:
+            stream.accept(stamp_ns - stream.offset, image)
+            return self._decide(final=False)
+
+    def flush(self) -> list[SurroundSet[T]]:
+        """At the end of a recording: decide with what is queued, return the last sets, and start anew."""
+        with self._lock:
+            sets = self._decide(final=True)
+            self._clear("unmatched")
+            return sets
+
+    def reset(self) -> None:
+        """Drop everything queued and forget the stamps seen; counters and periods stay."""
+        with self._lock:
+            self._clear("reset")
+
+    def statistics(self) -> SynchronizerStatistics:
+        """Snapshot of the counters."""
+        with self._lock:
+            return SynchronizerStatistics(self._sets, {name: s.statistics() for name, s in self._streams.items()})
+
+    def _clear(self, reason: str) -> None:
+        for stream in self._streams.values():
+            stream.clear(reason)
+
+    def _decide(self, *, final: bool) -> list[SurroundSet[T]]:
+        sets: list[SurroundSet[T]] = []
+        while self._anchor.stamps:
+            anchor, *later = self._anchor.stamps[:2]
+            next_anchor = later[0] if later else None
+            nearest = []
+            for stream in self._streams.values():
+                stamp = stream.nearest(anchor, self._tolerance, next_anchor)
+                if not final and (stream.may_improve(anchor, stamp) or self._may_belong_to_next(anchor, stamp)):
+                    return sets  # the oldest anchor image waits, and the later ones with it
+                nearest.append(stamp)
+            stamps = [stamp for stamp in nearest if stamp is not None]
+            if len(stamps) == len(self._streams) and max(stamps) - min(stamps) <= self._tolerance:
+                sets.append(self._emit(stamps))
+            else:
+                self._pass_over(anchor)
+        return sets
+
+    def _may_belong_to_next(self, anchor: int, stamp: int | None) -> bool:
+        """Whether the image may turn out nearer to an anchor image that has not come yet."""
+        if stamp is None or stamp <= anchor or len(self._anchor.stamps) > 1:
+            return False
+        return self._anchor.period is None or _nearer_to_next(stamp, anchor, anchor + self._anchor.period)
+
+    def _emit(self, stamps: list[int]) -> SurroundSet[T]:
+        chosen = dict(zip(self._streams, stamps, strict=True))
+        surround_set = SurroundSet(
+            sequence=self._sets,
+            stamp_ns=self._anchor.stamps[0] + self._anchor.offset,
+            stamps_ns={name: stamp + self._streams[name].offset for name, stamp in chosen.items()},
+            images={name: self._streams[name].take(stamp) for name, stamp in chosen.items()},
+            spread_ns=max(stamps) - min(stamps),
+        )
+        self._sets += 1
+        return surround_set
+
+    def _pass_over(self, anchor: int) -> None:
+        self._anchor.drop_oldest("unmatched")
+        for stream in self._streams.values():
+            stream.drop_before(anchor - self._tolerance)
+
+
+class _Stream(Generic[T]):
+    """One camera's queue in the order of corrected stamps [ns], and what its stamps tell of its clock."""
+
+    def __init__(self, offset: int, queue_size: int, clock_jump: int) -> None:
+        self.offset = offset
+        self.stamps: list[int] = []  # of the queued images, ascending
+        self.newest: int | None = None  # latest stamp since the last clock step, whether still queued or not
+        self.period: int | None = None
+        self._images: dict[int, T] = {}
+        self._floor: int | None = None  # latest stamp that left the queue: nothing up to it can be used any more
+        self._behind: list[int] = []  # the stamps that arrived last, while they ascend and are older than the newest
+        self._intervals: deque[int] = deque(maxlen=_INTERVALS_FOR_PERIOD)
+        self._queue_size = queue_size
+        self._clock_jump = clock_jump
+        self._received = self._matched = self._clock_steps = 0
+        self._dropped: Counter[str] = Counter()
+
+    def accept(self, stamp: int, image: T) -> None:
+        """Queue the image, or count why not."""
+        self._received += 1
+        if self._steps_back(stamp):
+            self._clock_steps += 1
+            self.clear("clock_jump")
+        if stamp in self._images or stamp == self.newest:
+            self._dropped["duplicate_stamp"] += 1
+        elif self._floor is not None and stamp <= self._floor:
+            self._dropped["out_of_order"] += 1
+        else:
+            self._observe(stamp)
+            insort(self.stamps, stamp)
+            self._images[stamp] = image
+            if len(self.stamps) > self._queue_size:
+                self.drop_oldest("queue_full")
+
+    def nearest(self, anchor: int, tolerance: int, next_anchor: int | None) -> int | None:
+        """Stamp of the queued image nearest to the anchor, within the tolerance and not nearer to the next anchor."""
+        best = None
+        for stamp in self.stamps:
+            if stamp > anchor + tolerance or (next_anchor is not None and _nearer_to_next(stamp, anchor, next_anchor)):
+                break
+            if stamp >= anchor - tolerance and (best is None or _distance(stamp, anchor) < _distance(best, anchor)):
+                best = stamp
+        return best
+
+    def may_improve(self, anchor: int, stamp: int | None) -> bool:
+        """Whether an image still to come may be nearer to the anchor than the queued one of this stamp, if any."""
+        if self.newest is None:
+            return True
+        if self.newest >= anchor:
+            return False
+        if stamp is None or self.period is None:
+            return True
+        return _distance(self.newest + self.period, anchor) < _distance(stamp, anchor)
+
+    def take(self, stamp: int) -> T:
+        """Remove a queued image for a set; the older ones are passed over."""
+        self.drop_before(stamp)
+        self._matched += 1
+        return self._pop_oldest()
+
+    def drop_before(self, stamp: int) -> None:
+        while self.stamps and self.stamps[0] < stamp:
+            self.drop_oldest("unmatched")
+
+    def drop_oldest(self, reason: str) -> None:
+        self._pop_oldest()
+        self._dropped[reason] += 1
+
+    def clear(self, reason: str) -> None:
+        """Empty the queue and take the next image whatever its stamp; the period is still good."""
+        self._dropped[reason] += len(self.stamps)
+        self.stamps.clear()
+        self._images.clear()
+        self._behind.clear()
+        self.newest = self._floor = None
+
+    def statistics(self) -> CameraStatistics:
+        dropped = {reason: count for reason, count in self._dropped.items() if count}
+        queued = len(self.stamps)
+        return CameraStatistics(self._received, self._matched, queued, dropped, self._clock_steps, self.period)
+
+    def _pop_oldest(self) -> T:
+        self._floor = self.stamps.pop(0)
+        return self._images.pop(self._floor)
+
+    def _steps_back(self, stamp: int) -> bool:
+        if self.newest is None or stamp >= self.newest:
+            self._behind.clear()
+            return False
+        if self._behind and stamp <= self._behind[-1]:
+            self._behind.clear()
+        self._behind.append(stamp)
+        return self.newest - stamp > self._clock_jump or len(self._behind) >= _BEHIND_IN_A_ROW
+
+    def _observe(self, stamp: int) -> None:
+        if self.newest is not None and stamp > self.newest:
+            self._intervals.append(stamp - self.newest)
+            self.period = sorted(self._intervals)[len(self._intervals) // 2]
+        if self.newest is None or stamp > self.newest:
+            self.newest = stamp
+
+
+def _distance(stamp: int, anchor: int) -> int:
+    """Distance in quarters of a nanosecond, so that the 1.25 of a later image stays a whole number."""
+    return 5 * (stamp - anchor) if stamp > anchor else 4 * (anchor - stamp)
+
+
+def _nearer_to_next(stamp: int, anchor: int, next_anchor: int) -> bool:
+    return stamp - anchor >= next_anchor - stamp
+
+
+def _check_cameras(cameras: Sequence[str], anchor: str, offsets: Mapping[str, float]) -> None:
+    if isinstance(cameras, str) or len(cameras) < 2 or len(set(cameras)) != len(cameras):
+        raise ConfigError(f"cameras: expected at least two different names, found {cameras!r}")
+    if anchor not in cameras:
+        raise ConfigError(f"anchor: {anchor!r} is not one of {', '.join(cameras)}")
+    unknown = sorted(set(offsets) - set(cameras))
+    if unknown:
+        raise ConfigError(f"offsets: {', '.join(unknown)} not among the cameras {', '.join(cameras)}")
+
+
+def _to_nanoseconds(field: str, seconds: float, minimum: float = -math.inf) -> int:
+    number = isinstance(seconds, int | float) and not isinstance(seconds, bool)
+    if not number or not math.isfinite(seconds) or seconds < minimum:
+        bound = "" if math.isinf(minimum) else f" of at least {minimum}"
+        raise ConfigError(f"{field}: expected a number of seconds{bound}, found {seconds!r}")
+    return round(seconds * NANOSECONDS)
