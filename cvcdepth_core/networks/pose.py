@@ -34,10 +34,9 @@ class PoseNet(nn.Module):
 
         `earlier` and `later` are the two frames [B, V, 3, H, W] in [0, 1], always in temporal order.
         """
-        views = earlier.shape[1]
-        pairs = torch.cat([earlier, later], dim=2).flatten(0, 1)
-        features: Tensor = self.pose_encoder(pairs)[-1]
-        fused = features.unflatten(0, (-1, views)).mean(dim=1)
+        pairs = torch.cat([earlier, later], dim=2)
+        features: Tensor = self.pose_encoder(pairs.flatten(0, 1))[-1]
+        fused = features.view(*pairs.shape[:2], *features.shape[1:]).mean(dim=1)
         vector: Tensor = self.pose_decoder(fused)
         return vector[:, :3], vector[:, 3:].clamp(-_MAX_TRANSLATION, _MAX_TRANSLATION)
 
@@ -60,4 +59,5 @@ class PoseDecoder(nn.Module):
         """Map [B, C, H, W] to the six numbers of a motion [B, 6]."""
         for convolution in self.net[:-1]:
             features = F.relu(convolution(features))
-        return _OUTPUT_SCALE * self.net[-1](features).mean(dim=(2, 3))
+        vector: Tensor = self.net[-1](features).mean(dim=(2, 3))
+        return _OUTPUT_SCALE * vector

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Differentiable SE(3), back-projection and projection; every function takes any leading dimensions.
+
+Pixel centres are the integers, u to the right and v down; poses are named `target_T_source` and act on column vectors.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+PROJECTION_EPSILON = 1e-7
+"""Added to z before the division (method section 5)."""
+
+_LEAST_DENOMINATOR = 1e-12  # keeps coordinates and their gradients finite in the focal plane, in float32 too
+
+
+def axis_angle_to_rotation(axis_angle: Tensor) -> Tensor:
+    """Return the rotation matrices [..., 3, 3] of `axis_angle` [..., 3] in radians; differentiable at zero."""
+    x, y, z = axis_angle.unbind(-1)
+    zero = torch.zeros_like(x)
+    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).view(*x.shape, 3, 3)
+    rotation: Tensor = torch.linalg.matrix_exp(skew)
+    return rotation
+
+
+def rotation_to_euler_xyz(rotation: Tensor) -> Tensor:
+    """Return the angles [..., 3] (rad) with `rotation` [..., 3, 3] = Rx(a) Ry(b) Rz(c)."""
+    a = torch.atan2(-rotation[..., 1, 2], rotation[..., 2, 2])
+    b = torch.asin(rotation[..., 0, 2].clamp(-1.0, 1.0))
+    c = torch.atan2(-rotation[..., 0, 1], rotation[..., 0, 0])
+    return torch.stack([a, b, c], dim=-1)
+
+
+def rigid(rotation: Tensor, translation: Tensor) -> Tensor:
+    """Return the poses [..., 4, 4] made of `rotation` [..., 3, 3] and `translation` [..., 3] in metres."""
+    top = torch.cat([rotation, translation[..., None]], dim=-1)
+    bottom = torch.zeros_like(top[..., :1, :])
+    bottom[..., 3] = 1.0
+    return torch.cat([top, bottom], dim=-2)
+
+
+def rigid_inverse(target_T_source: Tensor) -> Tensor:
+    """Return `source_T_target` [..., 4, 4]."""
+    rotation = target_T_source[..., :3, :3].mT
+    return rigid(rotation, -(rotation @ target_T_source[..., :3, 3:]).squeeze(-1))
+
+
+def pixel_rays(inverse_intrinsics: Tensor, height: int, width: int) -> Tensor:
+    """Return the points [..., 3, H*W] at z = 1 m behind every pixel, row by row.
+
+    `inverse_intrinsics` [..., 3, 3] belongs to an image of `height` x `width` pixels.
+    """
+    ones = inverse_intrinsics.new_ones(height, width)
+    v, u = ones.cumsum(0) - 1, ones.cumsum(1) - 1
+    pixels = torch.stack([u, v, ones]).flatten(1)
+    return inverse_intrinsics @ pixels
+
+
+def back_project(depth: Tensor, inverse_intrinsics: Tensor) -> Tensor:
+    """Return the camera-frame points [..., 3, H*W] in metres of `depth` [..., 1, H, W] (metres along z)."""
+    height, width = depth.shape[-2:]
+    return pixel_rays(inverse_intrinsics, height, width) * depth.flatten(-2)
+
+
+def transform(target_T_source: Tensor, points: Tensor) -> Tensor:
+    """Move `points` [..., 3, M] of the source frame to the target frame by poses [..., 4, 4]."""
+    return target_T_source[..., :3, :3] @ points + target_T_source[..., :3, 3:]
+
+
+def project(points: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
+    """Project camera-frame `points` [..., 3, M] (metres) with `intrinsics` [..., 3, 3].
+
+    Gives pixels [..., 2, M] and z [..., 1, M]. Points behind the camera are projected too: see z.
+    """
+    homogeneous = intrinsics @ points
+    z = homogeneous[..., 2:, :]
+    denominator = z + PROJECTION_EPSILON
+    denominator = torch.where(denominator.abs() < _LEAST_DENOMINATOR, _LEAST_DENOMINATOR, denominator)
+    return homogeneous[..., :2, :] / denominator, z
