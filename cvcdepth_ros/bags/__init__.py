@@ -4,11 +4,13 @@
 from cvcdepth_ros.bags.recording import Recording, open_recording
 from cvcdepth_ros.bags.topics import LATCHED, RecordedMessage, Topic, qos_profile
 from cvcdepth_ros.bags.typestores import typestore
+from cvcdepth_ros.bags.writer import RecordingWriter
 
 __all__ = [
     "LATCHED",
     "RecordedMessage",
     "Recording",
+    "RecordingWriter",
     "Topic",
     "open_recording",
     "qos_profile",

@@ -122,7 +122,7 @@ class Recording:
         if type_ not in self.typestore.fielddefs:
             raise RecordingError(f"{where}: type {type_} is not known, and the recording carries no definition of it")
         try:
-            return self.typestore.deserialize_cdr(message.cdr, type_)
+            return self.typestore.deserialize_cdr(memoryview(message.cdr), type_)
         except (SerdeError, ValueError) as error:
             raise RecordingError(f"{where}: {len(message.cdr)} bytes that are no {type_}: {error}") from error
 

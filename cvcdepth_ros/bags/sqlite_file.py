@@ -46,10 +46,18 @@ class SqliteFile:
                 self._report(f"reading stopped after {count} messages ({error})")
 
     def _connect(self) -> sqlite3.Connection:
-        """Open without changing anything; `immutable` spares locks but would not look at a write-ahead log."""
+        """Open without changing or creating any file, so that recordings on read-only storage are read too.
+
+        `immutable` would not look at a write-ahead log. To read one, SQLite wants locks and an index file beside it,
+        unless the database is taken for exclusive use with locking switched off.
+        """
         log = self.path.with_name(self.path.name + "-wal")
-        immutable = "" if log.exists() and log.stat().st_size else "&immutable=1"
-        return sqlite3.connect(f"file:{quote(str(self.path.resolve()))}?mode=ro{immutable}", uri=True)
+        leftover = log.exists() and log.stat().st_size > 0
+        option = "vfs=unix-none" if leftover else "immutable=1"
+        database = sqlite3.connect(f"file:{quote(str(self.path.resolve()))}?mode=ro&{option}", uri=True)
+        if leftover:
+            database.execute("PRAGMA locking_mode=EXCLUSIVE")
+        return database
 
     def _readable_names(self, database: sqlite3.Connection) -> dict[int, str]:
         names = {}

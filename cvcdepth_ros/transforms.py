@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frames and the transforms between them, as `/tf_static` and `/tf` tell them (REP 105). Nothing here imports ROS.
+
+Messages are taken by their attributes, so rclpy's objects and those of a recording both fit.
+"""
+
+from bisect import bisect_left
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cvcdepth_core.errors import TransformError
+from cvcdepth_core.poses import Pose, check_rigid, inverse, pose_from_quaternion, quaternion_from_rotation
+
+# Below this angle (radians) between two rotations a straight line between their quaternions is exact in float64.
+_SMALL_ANGLE = 1e-6
+
+
+def frame_name(frame_id: str) -> str:
+    """Return the frame id without the leading slash that tf1 and some drivers write."""
+    return frame_id.lstrip("/")
+
+
+class TransformTree:
+    """The tree of fixed transforms of a vehicle."""
+
+    def __init__(self) -> None:
+        self._parents: dict[str, tuple[str, Pose]] = {}  # child -> (parent, parent_T_child)
+
+    @property
+    def frames(self) -> list[str]:
+        """All frames that are known, sorted."""
+        return sorted(self._parents.keys() | {parent for parent, _ in self._parents.values()})
+
+    def add(self, parent: str, child: str, parent_T_child: Pose) -> None:
+        """Add a link, or renew the one that is there; `parent_T_child` [4, 4] in metres.
+
+        Raises TransformError when the matrix is not rigid, the child has another parent already, or a loop would close.
+        """
+        parent, child = frame_name(parent), frame_name(child)
+        check_rigid(parent_T_child, f"transform {parent} <- {child}")
+        known, _ = self._parents.get(child, (parent, None))
+        if known != parent:
+            raise TransformError(f"frame '{child}' has two parents, '{known}' and '{parent}'")
+        if child in self._ancestors(parent):
+            raise TransformError(f"transform {parent} <- {child} closes a loop: {' <- '.join(self._ancestors(parent))}")
+        self._parents[child] = parent, np.array(parent_T_child, dtype=np.float64)
+
+    def add_message(self, message: Any) -> None:
+        """Add the transforms of a `tf2_msgs/TFMessage`; raises TransformError like `add`, and for a bad quaternion."""
+        for _, parent, child, parent_T_child in _links(message):
+            self.add(parent, child, parent_T_child)
+
+    def lookup(self, target_frame: str, source_frame: str) -> Pose:
+        """Return target_T_source [4, 4], which takes points of the source frame to the target frame.
+
+        Raises TransformError, naming the frame that is missing and those that are known, when nothing connects them.
+        """
+        target, source = frame_name(target_frame), frame_name(source_frame)
+        known = self.frames
+        for frame in (target, source):
+            if frame not in known:
+                raise TransformError(
+                    f"no transform {target} <- {source}: frame '{frame}' is unknown; known are {known}"
+                )
+        target_root, root_T_target = self._to_root(target)
+        source_root, root_T_source = self._to_root(source)
+        if target_root != source_root:
+            raise TransformError(
+                f"no transform {target} <- {source}: '{target}' hangs from '{target_root}', '{source}' from "
+                f"'{source_root}', and nothing connects the two; known are {known}"
+            )
+        return inverse(root_T_target) @ root_T_source
+
+    def _ancestors(self, frame: str) -> list[str]:
+        """Return the frame itself, its parent, and so on up to the root."""
+        chain = [frame]
+        while chain[-1] in self._parents:
+            chain.append(self._parents[chain[-1]][0])
+        return chain
+
+    def _to_root(self, frame: str) -> tuple[str, Pose]:
+        *links, root = self._ancestors(frame)
+        root_T_frame = np.eye(4)
+        for child in links:
+            root_T_frame = self._parents[child][1] @ root_T_frame
+        return root, root_T_frame
+
+
+class PoseTrack:
+    """One moving link (odom to base_link, say) over time."""
+
+    def __init__(self, parent: str, child: str) -> None:
+        self.parent, self.child = frame_name(parent), frame_name(child)
+        self._stamps: list[int] = []
+        self._poses: list[Pose] = []
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    @property
+    def span(self) -> tuple[int, int]:
+        """First and last stamp, ns. Raises TransformError when nothing was added."""
+        if not self._stamps:
+            raise TransformError(f"no transform {self.parent} <- {self.child} at any time")
+        return self._stamps[0], self._stamps[-1]
+
+    def add(self, stamp: int, parent_T_child: Pose) -> None:
+        """Add the pose [4, 4] at a stamp (ns), in any order; a stamp that is there already is renewed."""
+        check_rigid(parent_T_child, f"transform {self.parent} <- {self.child} at {stamp} ns")
+        index = bisect_left(self._stamps, stamp)
+        if index < len(self) and self._stamps[index] == stamp:
+            self._poses[index] = parent_T_child
+            return
+        self._stamps.insert(index, stamp)
+        self._poses.insert(index, parent_T_child)
+
+    def add_message(self, message: Any) -> None:
+        """Add the transforms of a `tf2_msgs/TFMessage` that are of this link; the others are passed over."""
+        for stamp, parent, child, parent_T_child in _links(message):
+            if (parent, child) == (self.parent, self.child):
+                self.add(stamp, parent_T_child)
+
+    def lookup(self, stamp: int) -> Pose:
+        """Return parent_T_child [4, 4] at a stamp (ns): translation interpolated linearly, rotation by slerp.
+
+        Raises TransformError outside of the span: nothing is extrapolated.
+        """
+        first, last = self.span
+        if not first <= stamp <= last:
+            raise TransformError(
+                f"no transform {self.parent} <- {self.child} at {stamp} ns: it is known from {first} to {last} ns"
+            )
+        index = bisect_left(self._stamps, stamp)
+        if self._stamps[index] == stamp:
+            return np.array(self._poses[index])
+        before = self._stamps[index - 1]
+        fraction = (stamp - before) / (self._stamps[index] - before)
+        return _interpolated(self._poses[index - 1], self._poses[index], fraction)
+
+
+def _links(message: Any) -> Iterator[tuple[int, str, str, Pose]]:
+    """Give stamp (ns), parent, child and parent_T_child of every transform of a TFMessage."""
+    for link in message.transforms:
+        stamp = link.header.stamp.sec * 10**9 + link.header.stamp.nanosec
+        parent, child = frame_name(link.header.frame_id), frame_name(link.child_frame_id)
+        t, q = link.transform.translation, link.transform.rotation
+        pose = pose_from_quaternion((t.x, t.y, t.z), (q.x, q.y, q.z, q.w), f"transform {parent} <- {child}")
+        yield stamp, parent, child, pose
+
+
+def _interpolated(start: Pose, end: Pose, fraction: float) -> Pose:
+    translation = (1 - fraction) * start[:3, 3] + fraction * end[:3, 3]
+    rotation = _slerp(quaternion_from_rotation(start[:3, :3]), quaternion_from_rotation(end[:3, :3]), fraction)
+    return pose_from_quaternion(_floats(translation), _floats(rotation))
+
+
+def _slerp(start: NDArray[np.float64], end: NDArray[np.float64], fraction: float) -> NDArray[np.float64]:
+    """Return the unit quaternion on the shorter great arc between two, at constant angular speed (Shoemake 1985)."""
+    end = end if start @ end >= 0 else -end
+    angle = 2 * np.arctan2(np.linalg.norm(end - start), np.linalg.norm(end + start))
+    if angle < _SMALL_ANGLE:
+        return start + fraction * (end - start)
+    blended: NDArray[np.float64] = (np.sin((1 - fraction) * angle) * start + np.sin(fraction * angle) * end) / np.sin(
+        angle
+    )
+    return blended
+
+
+def _floats(values: NDArray[np.float64]) -> Sequence[float]:
+    return [float(value) for value in values]
