@@ -17,8 +17,7 @@ from cvcdepth_core.calibration import Calibration, calibration_from_fields
 from cvcdepth_core.errors import ConfigError
 from cvcdepth_core.images import Picture, decode_compressed, decode_raw
 from cvcdepth_core.poses import Pose, quaternion_from_rotation
-
-NANOSECONDS = 1_000_000_000
+from cvcdepth_ros.synchronizer import NANOSECONDS
 
 _FLOAT32_DATATYPE = 7  # sensor_msgs/PointField.FLOAT32
 _MILLIMETRES = 1000.0

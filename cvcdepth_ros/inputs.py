@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node's subscriptions: images, camera_info and static transforms, each with what can go wrong on its topic."""
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+
+from cvcdepth_core.errors import ConfigError
+from cvcdepth_core.rig import RigLayout
+from cvcdepth_ros.camera_discovery import COMPRESSED_IMAGE_TYPE, IMAGE_TYPE
+
+_IMAGE_CLASSES = {IMAGE_TYPE: Image, COMPRESSED_IMAGE_TYPE: CompressedImage}
+_INPUT_DEPTH = 10
+
+
+@dataclass(frozen=True)
+class ReceivedImage:
+    """An image message and when it came in, on the monotonic clock."""
+
+    message: Any
+    received: float
+
+
+def topic_types(node: Node) -> dict[str, list[str]]:
+    """Return the types of every topic in the graph."""
+    return dict(node.get_topic_names_and_types())
+
+
+class CameraInputs:
+    """Subscribes each camera's topics, images as soon as the graph tells whether they are raw or compressed."""
+
+    def __init__(
+        self,
+        node: Node,
+        layout: RigLayout,
+        reliable: bool,
+        on_image: Callable[[str, ReceivedImage], None],
+        on_camera_info: Callable[[str, Any], None],
+    ) -> None:
+        """Both callbacks get the camera's name first; they run on the executor's thread and must be short."""
+        self._node = node
+        self._qos = input_qos(reliable)
+        self._on_image = on_image
+        self._image_topics = {camera.name: camera.image_topic for camera in layout.cameras}
+        self._subscriptions: list[Subscription] = []
+        self._connected: set[str] = set()
+        self._qos_problems: dict[str, str] = {}
+        self.lost: dict[str, int] = dict.fromkeys(self._image_topics, 0)
+        for camera in layout.cameras:
+            self._subscribe(camera.name, CameraInfo, camera.camera_info_topic, partial(on_camera_info, camera.name))
+
+    def connect(self) -> None:
+        """Subscribe the image topics that have appeared since the last call."""
+        types = topic_types(self._node)
+        for camera, topic in self._image_topics.items():
+            known = [_IMAGE_CLASSES[name] for name in types.get(topic, ()) if name in _IMAGE_CLASSES]
+            if camera not in self._connected and known:
+                self._connected.add(camera)
+                self._subscribe(camera, known[0], topic, partial(self._receive_image, camera))
+
+    def problems(self) -> Mapping[str, str]:
+        """Say for each camera why no image can arrive; cameras without such a reason are left out."""
+        types = topic_types(self._node)
+        found = {
+            camera: self._problem(camera, topic, types.get(topic, [])) for camera, topic in self._image_topics.items()
+        }
+        return {camera: problem for camera, problem in found.items() if problem}
+
+    def close(self) -> None:
+        """Drop all subscriptions."""
+        for subscription in self._subscriptions:
+            self._node.destroy_subscription(subscription)
+        self._subscriptions.clear()
+
+    def _qos_problem(self, camera: str) -> str:
+        return next((text for text in self._qos_problems.values() if text.startswith(f"camera {camera}: ")), "")
+
+    def _problem(self, camera: str, topic: str, types: list[str]) -> str:
+        if not self._node.count_publishers(topic):
+            return f"camera {camera}: no publisher on {topic}"
+        if camera not in self._connected:
+            return f"camera {camera}: {topic} carries {', '.join(types)}, want {' or '.join(_IMAGE_CLASSES)}"
+        return ""
+
+    def _receive_image(self, camera: str, message: Any) -> None:
+        self._on_image(camera, ReceivedImage(message, time.monotonic()))
+
+    def _subscribe(self, camera: str, message_class: type, topic: str, callback: Callable[[Any], None]) -> None:
+        def incompatible_qos(event: Any) -> None:
+            policy = qos_policy_name_from_kind(event.last_policy_kind)
+            self._qos_problems[topic] = (
+                f"camera {camera}: {topic}: its publisher's QoS does not match ours in {policy}; "
+                "see the parameters reliable and qos_overrides"
+            )
+
+        def message_lost(event: Any) -> None:
+            self.lost[camera] += event.total_count_change
+
+        def receive(message: Any) -> None:
+            self._qos_problems.pop(topic, None)
+            callback(message)
+
+        subscription = self._node.create_subscription(
+            message_class,
+            topic,
+            receive,
+            self._qos,
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=incompatible_qos, message_lost=message_lost),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+        )
+        self._subscriptions.append(subscription)
+
+
+class StaticTransformInput:
+    """Subscribes `/tf_static`. Where tf2_msgs is not installed (the wheels lack it), building it is a ConfigError."""
+
+    def __init__(self, node: Node, on_transforms: Callable[[Any], None]) -> None:
+        try:
+            from tf2_msgs.msg import TFMessage
+        except ImportError as error:
+            raise ConfigError(
+                "the rig file leaves base_T_camera to /tf_static, but tf2_msgs is not installed here; "
+                "write a complete rig file with: bag_replay rig BAG -o rig.yaml"
+            ) from error
+        self._node = node
+        qos = QoSProfile(
+            history=HistoryPolicy.KEEP_LAST,
+            depth=100,
+            reliability=ReliabilityPolicy.RELIABLE,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL,
+        )
+        self._subscription = node.create_subscription(TFMessage, "/tf_static", on_transforms, qos)
+
+    def close(self) -> None:
+        """Drop the subscription."""
+        self._node.destroy_subscription(self._subscription)
+
+
+def input_qos(reliable: bool) -> QoSProfile:
+    """Sensor-data QoS with room for one second of a 10 Hz camera, or the same reliably."""
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=_INPUT_DEPTH,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.VOLATILE,
+    )

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`rig:=auto`: find the cameras of a running system, their calibrations and their poses."""
+
+import time
+from functools import partial
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.qos import qos_profile_sensor_data
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import CameraInfo
+
+from cvcdepth_core.errors import TransformError
+from cvcdepth_core.rig import CameraEntry, RigLayout
+from cvcdepth_ros.camera_discovery import discover_cameras
+from cvcdepth_ros.inputs import StaticTransformInput, topic_types
+from cvcdepth_ros.rig_assembly import RigAssembler
+
+_SETTLING_SECONDS = 3.0
+
+
+class LiveRigDiscovery:
+    """Watches the graph until its cameras stay the same for three seconds and each is calibrated and has a pose."""
+
+    def __init__(self, node: Node, base_frame: str) -> None:
+        """Start listening. ConfigError where tf2_msgs is not installed: then nothing tells the cameras' poses."""
+        self._node = node
+        self._base_frame = base_frame
+        self._entries: tuple[CameraEntry, ...] = ()
+        self._assembler: RigAssembler | None = None
+        self._subscriptions: list[Subscription] = []
+        self._static_transforms: list[Any] = []
+        self._transforms = StaticTransformInput(node, self._on_transforms)
+        self._changed = time.monotonic()
+
+    def poll(self) -> RigLayout | None:
+        """Look at the graph once more; return the complete layout when there is one."""
+        self._watch_graph()
+        settled = time.monotonic() - self._changed > _SETTLING_SECONDS
+        if not settled or self._assembler is None or self._assembler.problems():
+            return None
+        return self._assembler.completed_layout()
+
+    def problem(self) -> str:
+        """Say what is still missing."""
+        if len(self._entries) < 2:
+            names = ", ".join(entry.name for entry in self._entries) or "none"
+            return f"rig auto: waiting for at least two cameras with image and camera_info topics, found {names}"
+        problems = self._assembler.problems() if self._assembler else {}
+        return "rig auto: " + next(iter(problems.values()), "waiting for the set of cameras to settle")
+
+    def close(self) -> None:
+        """Drop all subscriptions."""
+        self._transforms.close()
+        self._drop_camera_infos()
+
+    def _watch_graph(self) -> None:
+        # A node's own outputs look like cameras too.
+        own = self._node.resolve_topic_name("~/")
+        types = {topic: names[0] for topic, names in topic_types(self._node).items() if not topic.startswith(own)}
+        entries = tuple(discover_cameras(types))
+        if entries == self._entries:
+            return
+        self._entries, self._changed = entries, time.monotonic()
+        self._drop_camera_infos()
+        self._assembler = None
+        if len(entries) >= 2:
+            self._assembler = RigAssembler(RigLayout(base_frame=self._base_frame, cameras=entries))
+            for message in self._static_transforms:
+                self._assembler.transforms.add_message(message)
+            self._subscriptions = [self._subscribe(entry, self._assembler) for entry in entries]
+
+    def _subscribe(self, entry: CameraEntry, assembler: RigAssembler) -> Subscription:
+        callback = partial(assembler.add_camera_info, entry.name)
+        return self._node.create_subscription(
+            CameraInfo, entry.camera_info_topic, lambda message: callback(message), qos_profile_sensor_data
+        )
+
+    def _on_transforms(self, message: Any) -> None:
+        self._static_transforms.append(message)
+        if self._assembler is not None:
+            try:
+                self._assembler.transforms.add_message(message)
+            except TransformError as error:
+                self._node.get_logger().error(f"/tf_static: {error}")
+
+    def _drop_camera_infos(self) -> None:
+        for subscription in self._subscriptions:
+            self._node.destroy_subscription(subscription)
+        self._subscriptions = []

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node's parameters: one model gives their defaults, descriptions, ranges and checks."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin
+
+import annotated_types
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic.fields import FieldInfo
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.node import Node
+
+from cvcdepth_core.calibration import first_validation_message
+from cvcdepth_core.checkpoint import DepthModelSpec
+from cvcdepth_core.errors import ConfigError
+from cvcdepth_core.estimator import DepthEstimator
+from cvcdepth_core.pointcloud import CloudLimits
+
+AUTO = "auto"
+
+CHANGEABLE_WHILE_RUNNING = ("cloud_stride", "cloud_min_range", "cloud_max_range")
+
+
+class NodeParameters(BaseModel):
+    """Everything that can be set; the docstring of each field is its ROS description."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+    rig: str = ""
+    """Rig file (YAML), or 'auto': find the cameras among the live topics and their poses on /tf_static."""
+    base_frame: str = "base_link"
+    """With rig 'auto': the vehicle's frame. A rig file names its own."""
+    checkpoint: str = ""
+    """Checkpoint file (safetensors) of the depth network."""
+    untrained: bool = False
+    """Run a network with random weights instead of a checkpoint. Its depth has the right form and no meaning."""
+    encoder: str = "resnet18"
+    """Untrained network only: resnet18 or resnet34. A checkpoint names its own."""
+    height: int = Field(384, ge=32, le=4096, multiple_of=32)
+    """Untrained network only: rows of its input. A checkpoint names its own."""
+    width: int = Field(640, ge=32, le=4096, multiple_of=32)
+    """Untrained network only: columns of its input. A checkpoint names its own."""
+    device: str = "auto"
+    """Where inference runs: auto (CUDA where there is one), cpu, cuda, cuda:1 ..."""
+    autostart: bool = True
+    """Configure and activate at start; switch off where a lifecycle manager does that."""
+    tolerance: float = Field(0.1, gt=0, le=10)
+    """Seconds that two images of one set may be apart."""
+    queue_size: int = Field(10, ge=2, le=1000)
+    """Images that are kept per camera while their set is not complete."""
+    max_age: float = Field(0.5, ge=0, le=3600)
+    """Seconds (ROS time) after which a waiting set is not worth inference any more; 0 takes any age."""
+    reliable: bool = False
+    """Subscribe images and camera_info reliably instead of with sensor-data QoS."""
+    depth_encoding: Literal["32FC1", "16UC1"] = "32FC1"
+    """Encoding of depth images: 32FC1 metres with NaN for unknown, or 16UC1 millimetres with 0 (REP 118)."""
+    cloud_stride: int = Field(2, ge=1, le=64)
+    """Merged cloud: every n-th row and column."""
+    cloud_min_range: float = Field(0.5, ge=0, le=1e4)
+    """Merged cloud: metres from a camera below which points are left out."""
+    cloud_max_range: float = Field(80.0, gt=0, le=1e4)
+    """Merged cloud: metres from a camera above which points are left out."""
+
+    def check_complete(self) -> None:
+        """Raise ConfigError where the parameters are each possible but together not enough to start with."""
+        if not self.rig:
+            raise ConfigError(f"parameter rig is empty: name a rig file, or '{AUTO}'")
+        if self.untrained == bool(self.checkpoint):
+            raise ConfigError(
+                f"parameters checkpoint '{self.checkpoint}' and untrained {self.untrained}: name a checkpoint file, or"
+                " set untrained to run random weights, whose depth means nothing"
+            )
+
+    def build_estimator(self) -> DepthEstimator:
+        """Load the checkpoint, or make the untrained network; CheckpointError or ConfigError says what is wrong."""
+        if not self.untrained:
+            return DepthEstimator.from_checkpoint(Path(self.checkpoint).expanduser(), self.device)
+        try:
+            spec = DepthModelSpec(
+                encoder=self.encoder, height=self.height, width=self.width, min_depth=1.5, max_depth=200.0
+            )
+        except ValidationError as error:
+            raise ConfigError(f"parameter {first_validation_message(error)}") from error
+        return DepthEstimator.untrained(spec, self.device)
+
+    @property
+    def cloud_limits(self) -> CloudLimits:
+        """The merged cloud's limits."""
+        return CloudLimits(self.cloud_stride, self.cloud_min_range, self.cloud_max_range)
+
+
+def declare_parameters(node: Node) -> None:
+    """Declare every parameter with its description and range."""
+    for name, field in NodeParameters.model_fields.items():
+        node.declare_parameter(name, field.default, _descriptor(name, field))
+
+
+def read_parameters(node: Node, changed: Iterable[Any] = ()) -> NodeParameters:
+    """Read and check the parameters as they stand, with `changed` (rclpy Parameters) in place of their old values.
+
+    ConfigError names the parameter and the value.
+    """
+    values = {name: node.get_parameter(name).value for name in NodeParameters.model_fields}
+    values |= {parameter.name: parameter.value for parameter in changed if parameter.name in values}
+    try:
+        return NodeParameters.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError(f"parameter {first_validation_message(error)}") from error
+
+
+def _descriptor(name: str, field: FieldInfo) -> ParameterDescriptor:
+    descriptor = ParameterDescriptor(name=name, description=field.description or "")
+    low, high, step = _limits(field)
+    if low is not None and field.annotation is int:
+        descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high or low), step=int(step))]
+    elif low is not None:
+        descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high or low))]
+    if get_origin(field.annotation) is Literal:
+        descriptor.additional_constraints = f"one of {', '.join(get_args(field.annotation))}"
+    return descriptor
+
+
+def _limits(field: FieldInfo) -> tuple[Any, Any, Any]:
+    """(lowest, highest, step) of a numeric field; (None, None, 0) where it has none."""
+    low = high = None
+    step: Any = 0
+    for constraint in field.metadata:
+        if isinstance(constraint, annotated_types.Ge | annotated_types.Gt):
+            low = constraint.ge if isinstance(constraint, annotated_types.Ge) else constraint.gt
+        elif isinstance(constraint, annotated_types.Le):
+            high = constraint.le
+        elif isinstance(constraint, annotated_types.MultipleOf):
+            step = constraint.multiple_of
+    return low, high, step

@@ -1,0 +1,237 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`surround_depth_node`: a managed node that turns synchronised camera images into depth images and point clouds."""
+
+import argparse
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock, ClockType
+from rclpy.executors import ExternalShutdownException
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
+from rclpy.utilities import remove_ros_args
+
+from cvcdepth_core.errors import CvcDepthError
+from cvcdepth_core.estimator import DepthEstimator
+from cvcdepth_core.rig import RigLayout, load_rig_layout
+from cvcdepth_ros.diagnostics import ERROR, OK, WARN, status
+from cvcdepth_ros.live_rig import LiveRigDiscovery
+from cvcdepth_ros.node_parameters import (
+    AUTO,
+    CHANGEABLE_WHILE_RUNNING,
+    NodeParameters,
+    declare_parameters,
+    read_parameters,
+)
+from cvcdepth_ros.process_setup import prepare_process
+from cvcdepth_ros.surround_session import SurroundSession
+
+_POLL_SECONDS = 0.25
+_DIAGNOSTICS_SECONDS = 1.0
+
+_HELP = """example:
+  surround_depth_node --ros-args -p rig:=rig.yaml -p checkpoint:=model.safetensors
+  surround_depth_node --ros-args --params-file config/surround_depth.yaml
+
+parameters (all are described by `ros2 param describe /surround_depth NAME`):
+"""
+
+
+class SurroundDepthNode(LifecycleNode):  # type: ignore[misc] # rclpy is not annotated
+    """Configure loads rig and network, activate subscribes and publishes; problems go to the log and /diagnostics."""
+
+    def __init__(self) -> None:
+        super().__init__("surround_depth")
+        declare_parameters(self)
+        self.add_on_set_parameters_callback(self._on_set_parameters)
+        self._parameters: NodeParameters | None = None
+        self._estimator: DepthEstimator | None = None
+        self._layout: RigLayout | None = None
+        self._discovery: LiveRigDiscovery | None = None
+        self._session: SurroundSession | None = None
+        self._failure = ""
+        self._reported: dict[str, str] = {}
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        # Steady time: with use_sim_time and no /clock yet, these must run all the same.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(_POLL_SECONDS, self._poll, clock=steady)
+        self.create_timer(_DIAGNOSTICS_SECONDS, self._publish_diagnostics, clock=steady)
+
+    def autostart(self) -> None:
+        """Configure and activate, unless the parameter says that somebody else will."""
+        if self.get_parameter("autostart").value and self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
+            self.trigger_activate()
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Read the parameters, the rig file and the checkpoint; FAILURE with the reason in the log."""
+        try:
+            parameters = read_parameters(self)
+            parameters.check_complete()
+            if parameters.rig != AUTO:
+                self._layout = load_rig_layout(Path(parameters.rig).expanduser())
+            self._estimator = parameters.build_estimator()
+        except CvcDepthError as error:
+            return self._fail(str(error))
+        self._parameters, self._failure = parameters, ""
+        self.get_logger().info(f"model: {self._estimator.model_id} on {self._estimator.device}")
+        if parameters.untrained:
+            self.get_logger().warning("untrained: the network has random weights and its depth means nothing")
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Subscribe and publish; with rig 'auto' as soon as the cameras are found."""
+        if self._parameters is None:
+            return TransitionCallbackReturn.FAILURE
+        try:
+            if self._layout is None:
+                self._discovery = LiveRigDiscovery(self, self._parameters.base_frame)
+            else:
+                self._start_session(self._layout)
+        except CvcDepthError as error:
+            return self._fail(str(error))
+        return super().on_activate(state)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop subscribing and publishing."""
+        self.stop()
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Forget rig and network."""
+        self.stop()
+        self._parameters = self._estimator = self._layout = None
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """End for good."""
+        return self.on_cleanup(state)
+
+    def stop(self) -> bool:
+        """End the active period; False when the worker is still inside its last inference."""
+        if self._discovery is not None:
+            self._discovery.close()
+            self._discovery = None
+        session, self._session = self._session, None
+        self._reported = {}
+        if session is None:
+            return True
+        for stage, summary in session.latencies.summaries().items():
+            self.get_logger().info(
+                f"{stage}: p50 {summary.p50_ms:.1f} ms, p95 {summary.p95_ms:.1f} ms, max {summary.max_ms:.1f} ms"
+            )
+        return session.close()
+
+    def _fail(self, reason: str) -> TransitionCallbackReturn:
+        self._failure = reason
+        self.get_logger().error(reason)
+        return TransitionCallbackReturn.FAILURE
+
+    def _start_session(self, layout: RigLayout) -> None:
+        if self._parameters is not None and self._estimator is not None:
+            self._session = SurroundSession(self, layout, self._estimator, self._parameters)
+            self._session.poll()
+
+    def _poll(self) -> None:
+        if self._discovery is not None:
+            layout = self._discovery.poll()
+            if layout is not None:
+                self.get_logger().info(f"rig auto: {', '.join(layout.names)}")
+                self._discovery.close()
+                self._discovery = None
+                self._start_session(layout)
+        if self._session is not None:
+            self._session.poll()
+            self._report(self._session.problems())
+
+    def _report(self, problems: dict[str, str]) -> None:
+        """Log each problem once, when it appears, and its end."""
+        for camera, problem in problems.items():
+            if self._reported.get(camera) != problem:
+                self.get_logger().warning(problem)
+        for camera in self._reported.keys() - problems.keys():
+            self.get_logger().info(f"camera {camera}: ok")
+        self._reported = problems
+
+    def _publish_diagnostics(self) -> None:
+        statuses = [self._node_status(), *(self._session.diagnostics() if self._session else [])]
+        for entry in statuses:
+            entry.name = f"{self.get_name()}: {entry.name}"
+            entry.hardware_id = self.get_fully_qualified_name()
+        message = DiagnosticArray(status=statuses)
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(message)
+
+    def _node_status(self) -> DiagnosticStatus:
+        if self._failure:
+            return status(ERROR, "node", self._failure)
+        if self._discovery is not None:
+            return status(WARN, "node", self._discovery.problem())
+        if self._session is None:
+            return status(OK, "node", "inactive" if self._parameters else "unconfigured")
+        return status(OK, "node", "active")
+
+    def _on_set_parameters(self, changed: Sequence[Parameter]) -> SetParametersResult:
+        fixed = [
+            p.name for p in changed if p.name in NodeParameters.model_fields and p.name not in CHANGEABLE_WHILE_RUNNING
+        ]
+        if fixed and self._parameters is not None:
+            return SetParametersResult(successful=False, reason=f"{', '.join(fixed)}: clean the node up first")
+        try:
+            read_parameters(self, changed)
+        except CvcDepthError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Run the node until it is interrupted or terminated."""
+    arguments = list(sys.argv if args is None else args)
+    _parse_command_line(remove_ros_args(arguments)[1:])
+    prepare_process()
+    rclpy.init(args=arguments)
+    try:
+        node = SurroundDepthNode()
+    except Exception as error:  # rclpy raises many kinds for a parameter override that is wrong
+        sys.exit(f"surround_depth_node: {str(error).splitlines()[0]}")
+    try:
+        node.autostart()
+        rclpy.spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    _end(node)
+
+
+def _end(node: SurroundDepthNode) -> None:
+    """Stop within two seconds, also in the middle of inference."""
+    # `ros2 launch` sends SIGINT to the group and again to each child; the second must not break the clean-up.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    finished = node.stop()
+    if not finished:
+        # A thread inside an inference cannot be stopped; leaving at once is safe, for its set is not published.
+        os._exit(0)
+    node.destroy_node()
+    rclpy.try_shutdown()
+
+
+def _parse_command_line(arguments: Sequence[str]) -> None:
+    parameters = "".join(
+        f"  {name:16} {field.description} [{field.default}]\n" for name, field in NodeParameters.model_fields.items()
+    )
+    parser = argparse.ArgumentParser(
+        prog="surround_depth_node",
+        description=__doc__,
+        epilog=_HELP + parameters,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.parse_args(arguments)
+
+
+if __name__ == "__main__":
+    main()
