@@ -6,10 +6,12 @@ PYTHON ?= python3
 TORCH ?= torch==2.13.0
 
 # A stamp's name carries the content that was installed: a changed lock is installed again, an unchanged one never.
+# Every installation into an environment removes the stamps of the former ones; dev contains demo.
 key = $(shell { echo "$(TORCH)"; cat requirements/$(1).lock setup.py; } | sha256sum | cut -c1-12)
 DEMO := .venv/installed/demo-$(call key,demo)
 DEV := .venv/installed/dev-$(call key,dev)
 CORE := .venv-core/installed/core_test-$(call key,core_test)
+TF2 := .venv/installed/tf2_msgs-$(shell cat tests/tf2_msgs/*.* tests/tf2_msgs/msg/* | sha256sum | cut -c1-12)
 
 # A sourced ROS 2 installation must not leak into the wheels' environment, and nothing here talks to other machines.
 unexport PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH CMAKE_PREFIX_PATH LD_LIBRARY_PATH RMW_IMPLEMENTATION ROS_DISTRO
@@ -41,7 +43,7 @@ test-core: $(CORE) ## the tests that need no ROS, where there is none
 	.venv-core/bin/python -m pytest
 
 tf2_msgs: $(DEV) ## build tf2_msgs, which has no wheel, for the tests of /tf_static (needs g++)
-	@.venv/bin/python tests/tf2_msgs/build.py
+	@test -e $(TF2) || .venv/bin/python tests/tf2_msgs/build.py $(TF2)
 
 lock: .venv-lock/bin/uv ## resolve requirements/*.in again (LOCK=--upgrade for newer versions)
 	$(call compile,dev) $(LOCK)
@@ -58,10 +60,11 @@ compile = .venv-lock/bin/uv pip compile --quiet --universal --python-version 3.1
 # pip shows its progress for torch, by far the largest download, and is quiet for the rest.
 define install
 @echo "Installing requirements/$(2).lock into $(1), once: about a minute, longer on a slow connection."
+@rm -rf $(1)/installed
 @$(1)/bin/pip install --only-binary :all: --constraint requirements/$(2).lock "$(TORCH)"
 @$(1)/bin/pip install -qq --only-binary :all: --no-binary empy --requirement requirements/$(2).lock
 @$(1)/bin/pip install -qq --no-deps --no-build-isolation --editable .
-@mkdir -p $(1)/installed && touch $@
+@mkdir $(1)/installed && touch $@
 endef
 
 $(DEMO): .venv/bin/python
@@ -69,6 +72,7 @@ $(DEMO): .venv/bin/python
 
 $(DEV): .venv/bin/python
 	$(call install,.venv,dev)
+	@touch $(DEMO)
 
 $(CORE): .venv-core/bin/python
 	$(call install,.venv-core,core_test)
