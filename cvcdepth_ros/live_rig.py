@@ -56,7 +56,7 @@ class LiveRigDiscovery:
 
     def _watch_graph(self) -> None:
         # A node's own outputs look like cameras too.
-        own = self._node.resolve_topic_name("~/")
+        own = f"{self._node.get_fully_qualified_name()}/"
         types = {topic: names[0] for topic, names in topic_types(self._node).items() if not topic.startswith(own)}
         entries = tuple(discover_cameras(types))
         if entries == self._entries:

@@ -50,7 +50,7 @@ class SurroundDepthNode(LifecycleNode):  # type: ignore[misc] # rclpy is not ann
         super().__init__("surround_depth")
         declare_parameters(self)
         self.add_on_set_parameters_callback(self._on_set_parameters)
-        self._parameters: NodeParameters | None = None
+        self._settings: NodeParameters | None = None
         self._estimator: DepthEstimator | None = None
         self._layout: RigLayout | None = None
         self._discovery: LiveRigDiscovery | None = None
@@ -78,7 +78,7 @@ class SurroundDepthNode(LifecycleNode):  # type: ignore[misc] # rclpy is not ann
             self._estimator = parameters.build_estimator()
         except CvcDepthError as error:
             return self._fail(str(error))
-        self._parameters, self._failure = parameters, ""
+        self._settings, self._failure = parameters, ""
         self.get_logger().info(f"model: {self._estimator.model_id} on {self._estimator.device}")
         if parameters.untrained:
             self.get_logger().warning("untrained: the network has random weights and its depth means nothing")
@@ -86,11 +86,11 @@ class SurroundDepthNode(LifecycleNode):  # type: ignore[misc] # rclpy is not ann
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Subscribe and publish; with rig 'auto' as soon as the cameras are found."""
-        if self._parameters is None:
+        if self._settings is None:
             return TransitionCallbackReturn.FAILURE
         try:
             if self._layout is None:
-                self._discovery = LiveRigDiscovery(self, self._parameters.base_frame)
+                self._discovery = LiveRigDiscovery(self, self._settings.base_frame)
             else:
                 self._start_session(self._layout)
         except CvcDepthError as error:
@@ -105,7 +105,7 @@ class SurroundDepthNode(LifecycleNode):  # type: ignore[misc] # rclpy is not ann
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Forget rig and network."""
         self.stop()
-        self._parameters = self._estimator = self._layout = None
+        self._settings = self._estimator = self._layout = None
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -133,8 +133,8 @@ class SurroundDepthNode(LifecycleNode):  # type: ignore[misc] # rclpy is not ann
         return TransitionCallbackReturn.FAILURE
 
     def _start_session(self, layout: RigLayout) -> None:
-        if self._parameters is not None and self._estimator is not None:
-            self._session = SurroundSession(self, layout, self._estimator, self._parameters)
+        if self._settings is not None and self._estimator is not None:
+            self._session = SurroundSession(self, layout, self._estimator, self._settings)
             self._session.poll()
 
     def _poll(self) -> None:
@@ -173,14 +173,14 @@ class SurroundDepthNode(LifecycleNode):  # type: ignore[misc] # rclpy is not ann
         if self._discovery is not None:
             return status(WARN, "node", self._discovery.problem())
         if self._session is None:
-            return status(OK, "node", "inactive" if self._parameters else "unconfigured")
+            return status(OK, "node", "inactive" if self._settings else "unconfigured")
         return status(OK, "node", "active")
 
     def _on_set_parameters(self, changed: Sequence[Parameter]) -> SetParametersResult:
         fixed = [
             p.name for p in changed if p.name in NodeParameters.model_fields and p.name not in CHANGEABLE_WHILE_RUNNING
         ]
-        if fixed and self._parameters is not None:
+        if fixed and self._settings is not None:
             return SetParametersResult(successful=False, reason=f"{', '.join(fixed)}: clean the node up first")
         try:
             read_parameters(self, changed)
