@@ -235,6 +235,17 @@ def test_an_unreadable_metadata_file_is_reported_and_not_needed(tmp_path: Path):
         assert "metadata.yaml: unreadable" in (recording.damage or "")
 
 
+def test_a_compressed_message_that_is_damaged_is_skipped_and_reported(sample: list[Entry], tmp_path: Path):
+    broken = [
+        entry._replace(cdr=b"\x28\xb5\x2f\xfd junk") if index < 9 else entry for index, entry in enumerate(sample)
+    ]
+    with open_recording(recordings.write_rosbag2(tmp_path / "bag", broken)) as recording:
+        for _ in range(2):
+            assert list(recording.messages()) == as_messages(sample[9:])
+        assert f"{sample[0].topic} at {sample[0].log_time} ns skipped" in (recording.damage or "")
+        assert (recording.damage or "").endswith("and 4 more")
+
+
 def test_channels_that_are_not_cdr_are_left_out_and_reported(sample: list[Entry], tmp_path: Path):
     with (tmp_path / "mixed.mcap").open("wb") as stream:
         writer = recordings.mcap.writer.Writer(stream)

@@ -25,7 +25,7 @@ from mcap.summary import Summary
 from zstandard import ZstdError
 
 from cvcdepth_ros.bags.ordering import Source, in_time_order
-from cvcdepth_ros.bags.topics import RecordedMessage, Topic, joined_topics, recorded_qos
+from cvcdepth_ros.bags.topics import RecordedMessage, RecordingFile, Topic, joined_topics, recorded_qos
 
 MAGIC = b"\x89MCAP0\r\n"
 _RECORD_HEADER = struct.Struct("<BQ")  # opcode, length of what follows
@@ -50,12 +50,11 @@ class _Index:
     blocks: list[_Block] = field(default_factory=list)
 
 
-class McapFile:
+class McapFile(RecordingFile):
     """One .mcap file, see `RecordingFile`."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        self.damage: list[str] = []
+        super().__init__(path)
         with path.open("rb") as stream:
             self._size = stream.seek(0, io.SEEK_END)
             self._index = self._indexed(stream) or self._scanned(stream)
@@ -95,7 +94,7 @@ class McapFile:
         try:
             summary = SeekingReader(stream).get_summary()
         except _DAMAGE as error:
-            self._report(f"index unreadable ({_text(error)})")
+            self._report("index unreadable", error)
             return None
         if summary is None or not _is_complete(summary):
             return None
@@ -131,7 +130,7 @@ class McapFile:
         try:
             return self._records_at(stream, offset)
         except _DAMAGE as error:
-            self._report(f"chunk at byte {offset} skipped ({_text(error)})")
+            self._report(f"chunk at byte {offset} skipped", error)
             return []
 
     def _records_at(self, stream: IO[bytes], offset: int) -> list[McapRecord]:
@@ -162,10 +161,6 @@ class McapFile:
             definition = schema.data.decode(errors="replace")
             qos = recorded_qos(channel.metadata.get("offered_qos_profiles"))
             yield Topic(channel.topic, schema.name, count, qos, definition or None)
-
-    def _report(self, damage: str) -> None:
-        if damage not in self.damage:
-            self.damage.append(damage)
 
 
 def _is_complete(summary: Summary) -> bool:
@@ -215,7 +210,3 @@ def _chunk_records(chunk: Chunk) -> list[McapRecord]:
     if not chunk.compression and len(chunk.data) != chunk.uncompressed_size:
         raise McapError(f"holds {len(chunk.data)} bytes, announces {chunk.uncompressed_size}")
     return breakup_chunk(chunk, validate_crc=True)
-
-
-def _text(error: BaseException) -> str:
-    return str(error) or type(error).__name__

@@ -30,6 +30,7 @@ _READERS: dict[bytes, Callable[[Path], RecordingFile]] = {
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _SUFFIXES = (".mcap", ".db3", ".bag", ".mcap.zstd", ".db3.zstd")
 _FOREVER = 2**63 - 1
+_SHOWN_DAMAGES = 5
 
 RecordingPath = str | Path
 
@@ -86,6 +87,8 @@ class Recording:
     def damage(self) -> str | None:
         """What could not be read, and why; None while all is well. It grows while messages are read."""
         found = [*self._damage, *(f"{file.path}: {damage}" for file in self._files for damage in file.damage)]
+        if len(found) > _SHOWN_DAMAGES:
+            found[_SHOWN_DAMAGES:] = [f"and {len(found) - _SHOWN_DAMAGES} more"]
         return "; ".join(found) or None
 
     @cached_property
@@ -98,13 +101,14 @@ class Recording:
     ) -> Iterator[RecordedMessage]:
         """Give the messages of `topics` (all by default) with start <= log_time < stop (ns) by log time.
 
-        Memory stays flat: one chunk of each file that is being read. Raises RecordingError for an unknown topic.
+        Memory stays flat: one chunk of each file that is being read. Raises RecordingError for an unknown topic, and
+        when the storage itself fails meanwhile.
         """
         wanted = set(self.topics if topics is None else topics)
         if unknown := wanted - self.topics.keys():
             raise RecordingError(f"{self.path}: no topic {sorted(unknown)}; it has {sorted(self.topics)}")
         first, last = 0 if start is None else start, _FOREVER if stop is None else stop
-        return _decompressed(
+        return self._unpacked_messages(
             in_time_order(
                 Source(file.start, partial(file.messages, wanted, first, last))
                 for file in self._files
@@ -125,6 +129,26 @@ class Recording:
             return self.typestore.deserialize_cdr(memoryview(message.cdr), type_)
         except (SerdeError, ValueError) as error:
             raise RecordingError(f"{where}: {len(message.cdr)} bytes that are no {type_}: {error}") from error
+
+    def _unpacked_messages(self, messages: Iterator[RecordedMessage]) -> Iterator[RecordedMessage]:
+        """Unpack messages that were compressed one by one; CDR begins with a zero byte, so they cannot be confused."""
+        try:
+            for message in messages:
+                if message.cdr[:4] != _ZSTD_MAGIC:
+                    yield message
+                elif (cdr := self._unpacked_cdr(message)) is not None:
+                    yield message._replace(cdr=cdr)
+        except OSError as error:
+            raise RecordingError(f"{self.path}: reading failed: {error.strerror or error}") from error
+
+    def _unpacked_cdr(self, message: RecordedMessage) -> bytes | None:
+        try:
+            return zstandard.decompress(message.cdr)
+        except zstandard.ZstdError as error:
+            damage = f"{self.path}: {message.topic} at {message.log_time} ns skipped ({error})"
+            if damage not in self._damage:
+                self._damage.append(damage)
+            return None
 
     def _span(self) -> tuple[int, int]:
         starts = [file.start for file in self._files if file.start is not None]
@@ -200,12 +224,3 @@ class Recording:
         except zstandard.ZstdError as error:
             raise RecordingError(f"{path}: cannot be decompressed: {error}") from error
         return target
-
-
-def _decompressed(messages: Iterator[RecordedMessage]) -> Iterator[RecordedMessage]:
-    """Unpack messages that were compressed one by one; CDR begins with a zero byte, so they cannot be confused."""
-    for message in messages:
-        if message.cdr[:4] == _ZSTD_MAGIC:
-            yield message._replace(cdr=zstandard.decompress(message.cdr))
-        else:
-            yield message

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reading of one ROS 1 .bag file; its messages are converted to CDR, its types to their ROS 2 form."""
 
+import struct
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
@@ -10,27 +11,31 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
 from cvcdepth_core.errors import RecordingError
-from cvcdepth_ros.bags.topics import LATCHED, RecordedMessage, Topic, joined_topics
+from cvcdepth_ros.bags.topics import LATCHED, RecordedMessage, RecordingFile, Topic, error_text, joined_topics
 from cvcdepth_ros.bags.typestores import typestore, typestore_for
 
 MAGIC = b"#ROSBAG V2.0\n"
-_HEADER = "std_msgs/msg/Header"  # has a sequence number in ROS 1 that ROS 2 dropped
+# What rosbags and the decompressors raise on damaged bytes (its reader also asserts; bz2: EOFError, lz4: RuntimeError).
+_DAMAGE = (ReaderError, SerdeError, AssertionError, struct.error, ValueError, EOFError, RuntimeError, OSError)
+# The types that ROS 1 lays out differently (the header has a sequence number there) or has built in.
+_ROS2_TYPES = ("std_msgs/msg/Header", "builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 
 
-class Ros1File:
+class Ros1File(RecordingFile):
     """One .bag file, see `RecordingFile`."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        self.damage: list[str] = []
+        super().__init__(path)
         try:
             with Reader(path) as reader:
                 self.topics = joined_topics([_topic(connection) for connection in reader.connections], path)
                 empty = reader.message_count == 0
                 self.start = None if empty else reader.start_time
                 self.end = None if empty else reader.end_time - 1
-        except ReaderError as error:
-            raise RecordingError(f"{path}: {error} (`rosbag reindex` repairs a bag that was cut)") from error
+        except _DAMAGE as error:
+            raise RecordingError(
+                f"{path}: {error_text(error)} (`rosbag reindex` repairs a bag that was cut)"
+            ) from error
         except TypesysError as error:
             raise RecordingError(f"{path}: message definition not understood: {error}") from error
         self._typestore = typestore_for(self.topics.values())
@@ -45,15 +50,13 @@ class Ros1File:
                     cdr = self._typestore.ros1_to_cdr(raw, connection.msgtype)
                     yield RecordedMessage(connection.topic, log_time, cdr)
                     count += 1
-            except (ReaderError, SerdeError, OSError, EOFError, RuntimeError) as error:
-                self.damage.append(f"reading stopped after {count} messages ({error})")
+            except _DAMAGE as error:
+                self._report(f"reading stopped after {count} messages", error)
 
 
 def _topic(connection: Connection) -> Topic:
     types = get_types_from_msg(connection.msgdef.data, connection.msgtype)
-    types[_HEADER] = typestore().fielddefs[_HEADER]
-    types["builtin_interfaces/msg/Time"] = typestore().fielddefs["builtin_interfaces/msg/Time"]
-    types["builtin_interfaces/msg/Duration"] = typestore().fielddefs["builtin_interfaces/msg/Duration"]
+    types.update({name: typestore().fielddefs[name] for name in _ROS2_TYPES})
     store = get_typestore(Stores.EMPTY)
     store.register(types)
     definition, _ = store.generate_msgdef(connection.msgtype, ros_version=2)

@@ -8,17 +8,16 @@ from pathlib import Path
 from urllib.parse import quote
 
 from cvcdepth_core.errors import RecordingError
-from cvcdepth_ros.bags.topics import RecordedMessage, Topic, joined_topics, recorded_qos
+from cvcdepth_ros.bags.topics import RecordedMessage, RecordingFile, Topic, joined_topics, recorded_qos
 
 MAGIC = b"SQLite format 3\0"
 
 
-class SqliteFile:
+class SqliteFile(RecordingFile):
     """One .db3 file, see `RecordingFile`."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        self.damage: list[str] = []
+        super().__init__(path)
         try:
             with closing(self._connect()) as database:
                 self._names = self._readable_names(database)
@@ -43,7 +42,7 @@ class SqliteFile:
                     yield RecordedMessage(wanted[id_], log_time, cdr)
                     count += 1
             except sqlite3.DatabaseError as error:
-                self._report(f"reading stopped after {count} messages ({error})")
+                self._report(f"reading stopped after {count} messages", error)
 
     def _connect(self) -> sqlite3.Connection:
         """Open without changing or creating any file, so that recordings on read-only storage are read too.
@@ -75,10 +74,6 @@ class SqliteFile:
         for id_, type_, profiles in database.execute(f"SELECT id, type, {qos} FROM topics ORDER BY id"):
             if id_ in self._names:
                 yield Topic(self._names[id_], type_, counts.get(id_, 0), recorded_qos(profiles), definitions.get(type_))
-
-    def _report(self, damage: str) -> None:
-        if damage not in self.damage:
-            self.damage.append(damage)
 
 
 def _definitions(database: sqlite3.Connection) -> dict[str, str]:

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every recording format has in common: topics, messages, and the protocol of a reader of one file."""
+"""What every recording format has in common: topics, messages, and what a reader of one file gives."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import ReaderError
@@ -53,21 +54,35 @@ class Topic:
         )
 
 
-class RecordingFile(Protocol):
+class RecordingFile(ABC):
     """A reader of one file. It keeps no file open between calls, so a recording may have any number of files."""
 
-    path: Path
     topics: dict[str, Topic]
     start: int | None
     """Log time of the first message, ns; None when the file holds no message."""
     end: int | None
     """Log time of the last message, ns."""
-    damage: list[str]
-    """What could not be read; grows while messages are read."""
 
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.damage: list[str] = []
+        """What could not be read; grows while messages are read."""
+
+    @abstractmethod
     def messages(self, topics: Collection[str], start: int, stop: int) -> Iterator[RecordedMessage]:
         """Give the messages of `topics` with start <= log_time < stop, in time order."""
-        ...
+
+    def _report(self, damage: str, error: BaseException | None = None) -> None:
+        """Add to `damage`, once however often it is met."""
+        if error is not None:
+            damage = f"{damage} ({error_text(error)})"
+        if damage not in self.damage:
+            self.damage.append(damage)
+
+
+def error_text(error: BaseException) -> str:
+    """Return the error's message; damaged bytes also raise errors that have none."""
+    return str(error) or type(error).__name__
 
 
 def joined_topics(topics: Collection[Topic], where: Path) -> dict[str, Topic]:
