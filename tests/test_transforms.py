@@ -46,7 +46,7 @@ def vehicle() -> TransformTree:
     tree = TransformTree()
     tree.add("base_link", "roof", shifted(1, 0, 2))
     tree.add("roof", "camera_left", turned(90, x=0.5))
-    tree.add("roof", "lidar", shifted(-1))
+    tree.add("roof", "lidar", shifted(-2))
     return tree
 
 
@@ -62,7 +62,7 @@ def test_points_go_down_the_tree(vehicle: TransformTree):
 
 
 def test_points_go_from_one_branch_to_another(vehicle: TransformTree):
-    np.testing.assert_allclose(vehicle.lookup("camera_left", "lidar") @ [1.5, 3, 0, 1], [3, 0, 0, 1], atol=1e-15)
+    np.testing.assert_allclose(vehicle.lookup("camera_left", "lidar") @ [2.5, 3, 0, 1], [3, 0, 0, 1], atol=1e-15)
 
 
 def test_a_frame_seen_from_itself_is_where_it_is(vehicle: TransformTree):
@@ -76,8 +76,8 @@ def test_leading_slashes_do_not_matter(vehicle: TransformTree):
 
 
 def test_a_link_that_is_sent_again_is_renewed(vehicle: TransformTree):
-    vehicle.add("roof", "lidar", shifted(-2))
-    assert vehicle.lookup("roof", "lidar")[0, 3] == -2
+    vehicle.add("roof", "lidar", shifted(-3))
+    assert vehicle.lookup("roof", "lidar")[0, 3] == -3
 
 
 def test_a_matrix_changed_later_by_its_owner_does_not_change_the_tree(vehicle: TransformTree):
