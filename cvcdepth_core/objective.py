@@ -15,7 +15,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
 from cvcdepth_core.geometry import back_project, rigid_inverse, transform
-from cvcdepth_core.losses import auto_mask, masked_mean, photometric_error, pose_consistency, smoothness
+from cvcdepth_core.losses import auto_mask, masked_mean, pose_consistency, smoothness
+from cvcdepth_core.photometric import photometric_error
 from cvcdepth_core.pose_distribution import motions_seen_from_anchor, relative_poses
 from cvcdepth_core.rig_batch import RigBatch
 from cvcdepth_core.view_synthesis import Warp, align_intensity, sample, splat_depth, sum_by_target, warp_views

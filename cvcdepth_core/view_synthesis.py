@@ -87,9 +87,11 @@ def align_intensity(
     both = (warp_mask * target_mask) > 0
     target_mean, target_std = overlap_statistics(target, both, masked_deviation)
     warp_mean, warp_std = overlap_statistics(warped, both, masked_deviation)
-    scale = target_std / (warp_std + _STD_EPSILON)
-    aligned = ((warped - warp_mean) * scale + target_mean) * warp_mask
-    return torch.where(both.any(dim=(-3, -2, -1), keepdim=True), aligned, warped)
+    gain = target_std / (warp_std + _STD_EPSILON)
+    offset = target_mean - warp_mean * gain
+    overlapping = both.any(dim=-1, keepdim=True).any(dim=-2, keepdim=True)
+    slope = torch.where(overlapping, gain * warp_mask, 1.0)
+    return torch.addcmul(torch.where(overlapping, offset * warp_mask, 0.0), warped, slope)
 
 
 @torch.no_grad()
@@ -100,14 +102,21 @@ def overlap_statistics(images: Tensor, overlap: Tensor, masked_deviation: bool) 
     `masked_deviation`.
     """
     over_view = (-3, -2, -1)
-    count = (overlap.sum(over_view, keepdim=True) * images.shape[-3]).clamp(min=1)
-    mean = (images * overlap).sum(over_view, keepdim=True) / count
-    squares = (images - mean).square()
+    weights = overlap.to(images.dtype)
+    count = (weights.sum(over_view, keepdim=True) * images.shape[-3]).clamp(min=1)
+    mean = _weighted_sum(images, weights) / count
     if masked_deviation:
-        variance = (squares * overlap).sum(over_view, keepdim=True) / count
+        variance = _weighted_sum((images - mean).square(), weights) / count
     else:
-        variance = squares.mean(over_view, keepdim=True)
+        spread, center = torch.var_mean(images, over_view, correction=0, keepdim=True)
+        variance = spread + (center - mean).square()
     return mean, (variance + _STD_EPSILON**2).sqrt()
+
+
+def _weighted_sum(images: Tensor, weights: Tensor) -> Tensor:
+    """Return the sum [..., 1, 1, 1] over channels and pixels, as a matrix product that needs no product image."""
+    per_channel = images.flatten(-2) @ weights.flatten(-2).mT
+    return per_channel.sum(dim=-2, keepdim=True).unsqueeze(-1)
 
 
 def sum_by_target(views: Tensor, targets: Tensor, cameras: int) -> Tensor:
