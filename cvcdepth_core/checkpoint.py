@@ -35,7 +35,7 @@ State = Mapping[str, Tensor]
 class DepthModelSpec(BaseModel):
     """What a depth network was built and trained for; it travels with the weights."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     encoder: str = "resnet18"
     """One of `DEPTH_ENCODERS`."""

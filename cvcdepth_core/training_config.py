@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The training configuration: typed, validated, read from YAML files that may build on one another."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from cvcdepth_core.augmentation import ColorJitterConfig, FlipMode
+from cvcdepth_core.checkpoint import DepthModelSpec
+from cvcdepth_core.errors import ConfigError
+from cvcdepth_core.objective import ObjectiveConfig
+from cvcdepth_core.surround_model import PoseMethod
+
+_BASE_KEY = "base"
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+
+class PoseConfig(_Section):
+    """The pose network."""
+
+    encoder: Literal["resnet18", "resnet34"] = "resnet18"
+    """Backbone."""
+    method: PoseMethod = "front"
+    """Whose motion is predicted from which images; see `SurroundModel`."""
+
+
+class AugmentationConfig(_Section):
+    """What the networks see differently from the losses."""
+
+    color_jitter: ColorJitterConfig = ColorJitterConfig()
+    """Random colour changes, per camera."""
+    flip: FlipMode = "both"
+    """Hflip-S: which networks see half of the samples mirrored."""
+
+
+class OptimizerConfig(_Section):
+    """Adam and its schedule."""
+
+    learning_rate: float = Field(default=1e-4, gt=0)
+    """At the start."""
+    betas: tuple[float, float] = (0.9, 0.999)
+    """Decay of Adam's two moments."""
+    epochs: int = Field(default=20, ge=1)
+    """Passes over the training samples."""
+    decay_after_epochs: int = Field(default=15, ge=1)
+    """The learning rate is multiplied by `decay_factor` after every so many epochs."""
+    decay_factor: float = Field(default=0.1, gt=0, le=1)
+    """See `decay_after_epochs`."""
+    samples_per_step: int = Field(default=4, ge=1)
+    """Samples, of all cameras each, whose gradients make one step: processes x samples per process x accumulation."""
+
+
+class EvaluationConfig(_Section):
+    """How predictions are scored."""
+
+    max_depth: float = Field(default=200.0, gt=0)
+    """Metres; ground truth at or beyond it is left out, predictions are clamped to it."""
+    flip_fusion: bool = False
+    """Predict the mirrored image too and fuse both depths ("pp")."""
+
+
+class TrainingConfig(_Section):
+    """Everything that decides what a training run computes."""
+
+    dataset: Literal["ddad", "nuscenes", "recording"] = "ddad"
+    """Where samples come from."""
+    depth: DepthModelSpec
+    """The depth network; checkpoints carry this."""
+    pose: PoseConfig = PoseConfig()
+    """The pose network."""
+    objective: ObjectiveConfig = ObjectiveConfig()
+    """Weights and variants of the loss."""
+    augmentation: AugmentationConfig = AugmentationConfig()
+    """What the networks see differently from the losses."""
+    optimizer: OptimizerConfig = OptimizerConfig()
+    """Adam and its schedule."""
+    evaluation: EvaluationConfig = EvaluationConfig()
+    """How predictions are scored."""
+    seed: int = Field(default=42, ge=0)
+    """Of every random draw; process r uses seed + r."""
+
+    @model_validator(mode="after")
+    def _pose_consistency_has_poses_to_compare(self) -> TrainingConfig:
+        if self.objective.pose_consistency > 0 and self.pose.method != "per_camera":
+            raise ValueError(
+                f"objective.pose_consistency is {self.objective.pose_consistency}, which compares the cameras' own "
+                f"motions, but pose.method is {self.pose.method!r}, expected 'per_camera'"
+            )
+        return self
+
+
+def load_training_config(path: str | Path) -> TrainingConfig:
+    """Read a training configuration; `base: FILE` names a file, relative to this one, that it builds on.
+
+    Raises ConfigError naming the file, the field, the value found and what is allowed.
+    """
+    path = Path(path)
+    try:
+        return TrainingConfig.model_validate(_read_with_bases(path, above=()))
+    except ValidationError as error:
+        raise ConfigError(
+            f"{path}: {'; '.join(_describe(item) for item in error.errors(include_url=False))}"
+        ) from error
+
+
+def _read_with_bases(path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
+    if path.resolve() in above:
+        raise ConfigError(f"{path}: {_BASE_KEY} leads back to the file itself")
+    fields = _read_yaml(path)
+    base = fields.pop(_BASE_KEY, None)
+    if base is None:
+        return fields
+    if not isinstance(base, str):
+        raise ConfigError(f"{path}: {_BASE_KEY} is {base!r}, expected the name of a file")
+    return _overlay(_read_with_bases(path.parent / base, (*above, path.resolve())), fields)
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigError(f"{path}: cannot be read: {' '.join(str(error).split())}") from error
+    if not isinstance(content, dict):
+        raise ConfigError(f"{path}: holds a {type(content).__name__}, expected fields with values")
+    return content
+
+
+def _overlay(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(base)
+    for key, value in changes.items():
+        below = merged.get(key)
+        merged[key] = _overlay(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
+    return merged
+
+
+def _describe(item: Mapping[str, Any]) -> str:
+    name = ".".join(map(str, item["loc"]))
+    if item["type"] == "extra_forbidden":
+        return f"{name} is no known field; {_known_fields(item['loc'])}"
+    if not name:
+        return str(item["msg"])
+    return f"{name} is {item['input']!r}: {item['msg']}"
+
+
+def _known_fields(location: tuple[str | int, ...]) -> str:
+    section: Any = TrainingConfig
+    for part in location[:-1]:
+        section = section.model_fields[part].annotation
+    return f"expected one of {', '.join(section.model_fields)}"
