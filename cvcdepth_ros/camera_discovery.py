@@ -55,15 +55,10 @@ def _image_topics(namespace: str, topic_types: Mapping[str, str]) -> list[str]:
 
 def _shortest_unique_names(namespaces: list[str]) -> dict[str, str]:
     """Call each camera by the last part of its namespace, or by more parts where that is not unique."""
-    names = {}
-    for namespace in namespaces:
-        parts = namespace.strip("/").split("/")
-        candidates = ["_".join(parts[-count:]) for count in range(1, len(parts) + 1)]
-        names[namespace] = next(
-            (name for name in candidates if sum(_ends_with(other, name) for other in namespaces) == 1), candidates[-1]
-        )
-    return names
-
-
-def _ends_with(namespace: str, name: str) -> bool:
-    return ("_" + "_".join(namespace.strip("/").split("/"))).endswith("_" + name)
+    parts = {namespace: namespace.strip("/").split("/") for namespace in namespaces}
+    depth = max((len(found) for found in parts.values()), default=1)
+    for count in range(1, depth + 1):
+        names = {namespace: "_".join(found[-count:]) for namespace, found in parts.items()}
+        if len(set(names.values())) == len(names):
+            break
+    return names if namespaces else {}

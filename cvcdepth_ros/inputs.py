@@ -9,7 +9,14 @@ from typing import Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
+from rclpy.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    QoSCompatibility,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_check_compatible,
+)
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
@@ -48,12 +55,12 @@ class CameraInputs:
     ) -> None:
         """Both callbacks get the camera's name first; they run on the executor's thread and must be short."""
         self._node = node
-        self._qos = input_qos(reliable)
+        self._reliable = reliable
         self._on_image = on_image
         self._image_topics = {camera.name: camera.image_topic for camera in layout.cameras}
-        self._subscriptions: list[Subscription] = []
+        self._subscriptions: dict[str, Subscription] = {}
+        self._cameras: dict[str, str] = {}
         self._connected: set[str] = set()
-        self._qos_problems: dict[str, str] = {}
         self.lost: dict[str, int] = dict.fromkeys(self._image_topics, 0)
         for camera in layout.cameras:
             self._subscribe(camera.name, CameraInfo, camera.camera_info_topic, partial(on_camera_info, camera.name))
@@ -71,53 +78,52 @@ class CameraInputs:
         """Say for each camera why no image can arrive; cameras without such a reason are left out."""
         types = topic_types(self._node)
         found = {
-            camera: self._problem(camera, topic, types.get(topic, [])) for camera, topic in self._image_topics.items()
+            camera: self._image_problem(camera, topic, types.get(topic, []))
+            for camera, topic in self._image_topics.items()
         }
-        return {camera: problem for camera, problem in found.items() if problem}
+        mismatches = {topic: self._qos_mismatch(topic) for topic in self._subscriptions}
+        found |= {self._cameras[topic]: text for topic, text in mismatches.items() if text}
+        return {camera: f"camera {camera}: {problem}" for camera, problem in found.items() if problem}
 
     def close(self) -> None:
         """Drop all subscriptions."""
-        for subscription in self._subscriptions:
+        for subscription in self._subscriptions.values():
             self._node.destroy_subscription(subscription)
         self._subscriptions.clear()
 
-    def _qos_problem(self, camera: str) -> str:
-        return next((text for text in self._qos_problems.values() if text.startswith(f"camera {camera}: ")), "")
-
-    def _problem(self, camera: str, topic: str, types: list[str]) -> str:
+    def _image_problem(self, camera: str, topic: str, types: list[str]) -> str:
         if not self._node.count_publishers(topic):
-            return f"camera {camera}: no publisher on {topic}"
+            return f"no publisher on {topic}"
         if camera not in self._connected:
-            return f"camera {camera}: {topic} carries {', '.join(types)}, want {' or '.join(_IMAGE_CLASSES)}"
+            return f"{topic} carries {', '.join(types)}, want {' or '.join(_IMAGE_CLASSES)}"
+        return ""
+
+    def _qos_mismatch(self, topic: str) -> str:
+        """Compare with every publisher's QoS in the graph: rclpy's event for it was seen not to come."""
+        own = self._subscriptions[topic].qos_profile
+        for publisher in self._node.get_publishers_info_by_topic(topic):
+            compatibility, reason = qos_check_compatible(publisher.qos_profile, own)
+            if compatibility == QoSCompatibility.ERROR:
+                return f"{topic}: QoS does not match: {reason} See the parameters reliable and qos_overrides."
         return ""
 
     def _receive_image(self, camera: str, message: Any) -> None:
         self._on_image(camera, ReceivedImage(message, time.monotonic()))
 
     def _subscribe(self, camera: str, message_class: type, topic: str, callback: Callable[[Any], None]) -> None:
-        def incompatible_qos(event: Any) -> None:
-            policy = qos_policy_name_from_kind(event.last_policy_kind)
-            self._qos_problems[topic] = (
-                f"camera {camera}: {topic}: its publisher's QoS does not match ours in {policy}; "
-                "see the parameters reliable and qos_overrides"
-            )
-
         def message_lost(event: Any) -> None:
             self.lost[camera] += event.total_count_change
 
-        def receive(message: Any) -> None:
-            self._qos_problems.pop(topic, None)
-            callback(message)
-
-        subscription = self._node.create_subscription(
+        self._cameras[topic] = camera
+        self._subscriptions[topic] = self._node.create_subscription(
             message_class,
             topic,
-            receive,
-            self._qos,
-            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=incompatible_qos, message_lost=message_lost),
+            callback,
+            # Overrides are written into the profile that is handed over: each subscription needs its own.
+            input_qos(self._reliable),
+            event_callbacks=SubscriptionEventCallbacks(message_lost=message_lost),
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
-        self._subscriptions.append(subscription)
 
 
 class StaticTransformInput:

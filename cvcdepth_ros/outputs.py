@@ -15,8 +15,6 @@ from cvcdepth_core.pointcloud import CloudLimits, merged_cloud, organised_cloud
 from cvcdepth_core.rig import Rig
 from cvcdepth_ros.messages import ros_message_factory
 
-_OUTPUT_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10, reliability=ReliabilityPolicy.RELIABLE)
-
 
 class _CameraPublishers(NamedTuple):
     depth: Publisher
@@ -90,6 +88,7 @@ class SurroundOutputs:
         return self._node.create_publisher(
             message_class,
             topic,
-            _OUTPUT_QOS,
+            # Overrides are written into the profile that is handed over: each publisher needs its own.
+            QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10, reliability=ReliabilityPolicy.RELIABLE),
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )

@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Real nodes over real DDS for the tests: the node as a process of its own, publishers and subscribers beside it.
+
+Knows nothing of the package's code but the node's module name and its topics.
+"""
+
+import itertools
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+PROFILE = Path(__file__).parent.parent / "config" / "fastdds_large_shm.xml"
+TIMEOUT = 60.0
+
+_domains = itertools.count(10 + os.getpid() % 80)
+
+
+def reliable(depth: int = 100, latched: bool = False) -> QoSProfile:
+    durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=ReliabilityPolicy.RELIABLE, durability=durability
+    )
+
+
+def best_effort(depth: int = 10) -> QoSProfile:
+    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+class RosGraph:
+    """One domain with this process's node and the processes it started."""
+
+    def __init__(self) -> None:
+        self.domain = next(_domains)
+        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+        os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = os.environ["FASTDDS_DEFAULT_PROFILES_FILE"] = str(PROFILE)
+        self._context = Context()
+        rclpy.init(context=self._context, domain_id=self.domain)
+        self.node = Node("test", context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        self.received: dict[str, list[Any]] = defaultdict(list)
+        self.statuses: dict[str, Any] = {}
+        self._processes: list[tuple[subprocess.Popen[bytes], Path]] = []
+        self._folder = tempfile.TemporaryDirectory()
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
+
+    def start_node(self, *arguments: str, **parameters: Any) -> "subprocess.Popen[bytes]":
+        """Start surround_depth_node with these parameters."""
+        pairs = [
+            f"{name}:={str(value).lower() if isinstance(value, bool) else value}" for name, value in parameters.items()
+        ]
+        options = list(itertools.chain.from_iterable(("-p", pair) for pair in pairs))
+        log = Path(self._folder.name) / f"{len(self._processes)}.log"
+        with log.open("wb") as output:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "cvcdepth_ros.surround_depth_node", "--ros-args", *options, *arguments],
+                env=os.environ | {"ROS_DOMAIN_ID": str(self.domain)},
+                stdout=output,
+                stderr=subprocess.STDOUT,
+            )
+        self._processes.append((process, log))
+        return process
+
+    def log(self) -> str:
+        """What the processes have printed."""
+        return "\n".join(path.read_text(errors="replace") for _, path in self._processes)
+
+    def subscribe(self, message_class: type, *topics: str) -> None:
+        """Collect the messages of these topics in `received`."""
+        for topic in topics:
+            self.node.create_subscription(message_class, topic, self.received[topic].append, reliable())
+
+    def spin_until(self, condition: Callable[[], Any], what: str, timeout: float = TIMEOUT) -> None:
+        """Spin until the condition holds; fail with what was awaited and the processes' output."""
+        deadline = time.monotonic() + timeout
+        while not condition():
+            if time.monotonic() > deadline:
+                texts = {name: status.message for name, status in self.statuses.items()}
+                raise AssertionError(
+                    f"waited {timeout:.0f} s in vain for {what}; diagnostics {texts}; log:\n{self.log()}"
+                )
+            self._executor.spin_once(timeout_sec=0.05)
+
+    def spin(self, seconds: float) -> None:
+        deadline = time.monotonic() + seconds
+        while (remaining := deadline - time.monotonic()) > 0:
+            self._executor.spin_once(timeout_sec=remaining)
+
+    def await_status(self, subject: str, text: str, timeout: float = TIMEOUT) -> Any:
+        """Wait until the node's diagnostic status of this subject says this text; return the status."""
+
+        def says() -> bool:
+            status = self.statuses.get(f"surround_depth: {subject}")
+            return status is not None and text in status.message
+
+        self.spin_until(says, f"status '{subject}' to say '{text}'", timeout)
+        return self.statuses[f"surround_depth: {subject}"]
+
+    def values(self, subject: str) -> dict[str, str]:
+        status = self.statuses.get(f"surround_depth: {subject}")
+        return {pair.key: pair.value for pair in status.values} if status else {}
+
+    def await_subscribers(self, topics: Sequence[str]) -> None:
+        """Wait until each topic has a subscriber."""
+        self.spin_until(lambda: all(self.node.count_subscribers(topic) for topic in topics), f"subscribers of {topics}")
+
+    def close(self) -> None:
+        for process, _ in self._processes:
+            if process.poll() is None:
+                process.send_signal(signal.SIGINT)
+        for process, _ in self._processes:
+            try:
+                process.wait(10)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        self._executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self._context)
+        self._folder.cleanup()
+
+    def _on_diagnostics(self, message: Any) -> None:
+        for status in message.status:
+            self.statuses[status.name] = status
