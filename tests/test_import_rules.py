@@ -5,6 +5,7 @@ import ast
 import re
 import subprocess
 import sys
+import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import pytest
@@ -64,3 +65,10 @@ def test_importing_them_all_imports_no_ros_package_through_another_module():
         [sys.executable, "-c", IMPORT_ALL_BUT_ROS, *names], cwd=ROOT, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
+
+
+def test_package_xml_declares_every_ros_package_that_is_imported():
+    sources = [path for folder in ("cvcdepth_ros", "launch") for path in (ROOT / folder).rglob("*.py")]
+    imported = {name for source in sources for name in imported_packages(source) if ROS.fullmatch(name)}
+    declared = {element.text for element in ElementTree.parse(ROOT / "package.xml").findall("exec_depend")}
+    assert imported <= declared
