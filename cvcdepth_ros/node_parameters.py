@@ -5,7 +5,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
-import annotated_types
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
@@ -111,25 +110,18 @@ def read_parameters(node: Node, changed: Iterable[Any] = ()) -> NodeParameters:
 
 def _descriptor(name: str, field: FieldInfo) -> ParameterDescriptor:
     descriptor = ParameterDescriptor(name=name, description=field.description or "")
-    low, high, step = _limits(field)
+    low, high = _limit(field, "ge", "gt"), _limit(field, "le")
     if low is not None and field.annotation is int:
-        descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high or low), step=int(step))]
+        step = _limit(field, "multiple_of") or 0
+        descriptor.integer_range = [IntegerRange(from_value=low, to_value=high, step=step)]
     elif low is not None:
-        descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high or low))]
+        descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
     if get_origin(field.annotation) is Literal:
         descriptor.additional_constraints = f"one of {', '.join(get_args(field.annotation))}"
     return descriptor
 
 
-def _limits(field: FieldInfo) -> tuple[Any, Any, Any]:
-    """(lowest, highest, step) of a numeric field; (None, None, 0) where it has none."""
-    low = high = None
-    step: Any = 0
-    for constraint in field.metadata:
-        if isinstance(constraint, annotated_types.Ge | annotated_types.Gt):
-            low = constraint.ge if isinstance(constraint, annotated_types.Ge) else constraint.gt
-        elif isinstance(constraint, annotated_types.Le):
-            high = constraint.le
-        elif isinstance(constraint, annotated_types.MultipleOf):
-            step = constraint.multiple_of
-    return low, high, step
+def _limit(field: FieldInfo, *kinds: str) -> Any:
+    """Return the field's constraint of one of these kinds; None where it has none."""
+    found = [getattr(constraint, kind, None) for constraint in field.metadata for kind in kinds]
+    return next((value for value in found if value is not None), None)
