@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Play a recording to the live node over DDS, record what the node publishes, and show it.
+
+Player, node and recorder are processes of their own, as on a vehicle. One folder gets it all: a picture of every set,
+demo.html, demo.json, the recording of the node's outputs, the rig file, the node's parameters, and the logs.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+from tqdm import tqdm
+
+from cvcdepth_core.errors import CvcDepthError
+from cvcdepth_core.rig import RigLayout, load_rig_layout
+from cvcdepth_ros.bags import open_recording
+from cvcdepth_ros.commands.arguments import positive
+from cvcdepth_ros.demo.clouds import LidarSweeps
+from cvcdepth_ros.demo.live_run import LiveOutcome, LiveRun
+from cvcdepth_ros.demo.paths import DemoPaths
+from cvcdepth_ros.demo.processes import children
+from cvcdepth_ros.demo.received import Output, ReceivedSets, SentSet, node_outputs, sent_sets
+from cvcdepth_ros.demo.result import UNTRAINED_WARNING, DemoResult
+from cvcdepth_ros.demo.sheets import SheetWriter
+from cvcdepth_ros.version import package_version
+
+SAMPLE = Path(__file__).parents[2] / "samples" / "pandaset_002_excerpt"
+NODE = "/surround_depth"
+
+_TOLERANCE_SECONDS = 0.1
+_SAMPLE_CREDIT = "Recording: PandaSet by Hesai and Scale AI, CC BY 4.0"
+_EXAMPLE = """example:
+  python -m cvcdepth_ros.demo --output output/demo
+  python -m cvcdepth_ros.demo --output output/drive --recording drive.mcap --checkpoint model.safetensors
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the demo; return 0 when every set was matched and every published one received, else 1."""
+    options = _parse(arguments)
+    try:
+        result = run(options)
+    except (CvcDepthError, OSError) as error:
+        print(f"demo: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("demo: interrupted", file=sys.stderr)
+        return 130
+    for problem in result.problems():
+        print(f"demo: {problem}", file=sys.stderr)
+    return 1 if result.problems() else 0
+
+
+def run(options: argparse.Namespace) -> DemoResult:
+    """Play, record, count, draw and tell."""
+    paths = DemoPaths(options.output)
+    paths.prepare()
+    if not options.checkpoint:
+        print(f"{UNTRAINED_WARNING}. No checkpoint was given: its weights are random.")
+    with children(paths.logs) as family:
+        live = LiveRun(family, paths, NODE)
+        live.write_rig(options.recording)
+        layout = load_rig_layout(paths.rig)
+        parameters = _write_parameters(options, paths)
+        outputs = node_outputs(NODE, layout.names, layout.anchor_camera)
+        outcome = live.play(options.recording, options.rate, options.duration, outputs)
+    result = _show(options, paths, layout, outputs, outcome, parameters)
+    print(f"\n{result.text()}\n\npictures  {paths.sheets}\npage      {paths.page}\nresult    {paths.result}")
+    if result.untrained:
+        print(UNTRAINED_WARNING)
+    return result
+
+
+def _show(
+    options: argparse.Namespace,
+    paths: DemoPaths,
+    layout: RigLayout,
+    outputs: Sequence[Output],
+    outcome: LiveOutcome,
+    parameters: dict[str, Any],
+) -> DemoResult:
+    """Draw what arrived, count it, and write pictures, page and result."""
+    with open_recording(options.recording) as recording:
+        sets = sent_sets(recording, layout, _TOLERANCE_SECONDS, outcome.sent)
+        received = ReceivedSets(paths.recording, outputs, sets)
+        notes = _notes(options, outcome, parameters)
+        lidar = LidarSweeps(recording, layout.base_frame)
+        writer = SheetWriter(layout.complete(), lidar, paths.sheets, notes, not options.checkpoint)
+        for _ in tqdm(writer.write(received, len(sets)), desc="drawing", total=outcome.node.published, unit=" sets"):
+            pass
+    result = _result(options, layout, sets, received, outcome, parameters, len(writer.jpegs))
+    paths.result.write_text(result.model_dump_json(indent=2) + "\n", encoding="utf-8")
+    if writer.jpegs:
+        paths.page.write_text(writer.page("Surround depth, computed live", result), encoding="utf-8")
+    return result
+
+
+def _result(
+    options: argparse.Namespace,
+    layout: RigLayout,
+    sets: Sequence[SentSet],
+    received: ReceivedSets,
+    outcome: LiveOutcome,
+    parameters: dict[str, Any],
+    complete: int,
+) -> DemoResult:
+    return DemoResult(
+        version=package_version(),
+        recording=str(options.recording),
+        rate=options.rate,
+        parameters=parameters,
+        untrained=not options.checkpoint,
+        sent=len(sets),
+        received=complete,
+        incomplete={sequence + 1: topics for sequence, topics in received.missing.items()},
+        node=outcome.node,
+        images_sent=sum(outcome.sent.get(camera.image_topic, 0) for camera in layout.cameras),
+        messages_received=outcome.received,
+        messages_lost=outcome.lost,
+    )
+
+
+def _write_parameters(options: argparse.Namespace, paths: DemoPaths) -> dict[str, Any]:
+    """Write the node's parameter file, and return the parameters."""
+    network = (
+        {"checkpoint": str(options.checkpoint.absolute())}
+        if options.checkpoint
+        else {"untrained": True, "height": options.height, "width": options.width}
+    )
+    parameters = {
+        "use_sim_time": True,
+        "rig": str(paths.rig.absolute()),
+        "tolerance": _TOLERANCE_SECONDS,
+        # On a busy machine best-effort images are lost where the player would wait with reliable ones.
+        "reliable": True,
+        **network,
+    }
+    content = {NODE.lstrip("/"): {"ros__parameters": parameters}}
+    paths.parameters.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+    return parameters
+
+
+def _notes(options: argparse.Namespace, outcome: LiveOutcome, parameters: dict[str, Any]) -> list[str]:
+    """Return the lines below every picture."""
+    size = f", {parameters['height']} x {parameters['width']}" if not options.checkpoint else ""
+    is_sample = options.recording.resolve() == SAMPLE
+    source = _SAMPLE_CREDIT if is_sample else f"Recording: {options.recording.name}"
+    return [f"Network: {outcome.node.model or 'none ran'}{size}. {source}"]
+
+
+def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="demo", description=__doc__, epilog=_EXAMPLE, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--output", type=Path, default=Path("output/demo"), help="folder for the results [%(default)s]")
+    parser.add_argument("--recording", type=Path, default=SAMPLE, help="what is played [the sample]")
+    parser.add_argument("--checkpoint", type=Path, help="trained network [an untrained one, whose depth means nothing]")
+    parser.add_argument(
+        "--rate",
+        type=positive,
+        default=0.05,
+        help="seconds of the recording per second; slow, so that a processor manages every set [%(default)s]",
+    )
+    parser.add_argument(
+        "--duration", type=positive, default=10.0, help="seconds of the recording, at most [%(default)s]"
+    )
+    parser.add_argument("--height", type=int, default=192, help="untrained network only: rows [%(default)s]")
+    parser.add_argument("--width", type=int, default=320, help="untrained network only: columns [%(default)s]")
+    return parser.parse_args(arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Record topics as they arrive, byte for byte, into a rosbag2 (MCAP) recording. Nothing else is stored."""
+
+import argparse
+import json
+import signal
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
+from rclpy.subscription import Subscription
+
+from cvcdepth_core.errors import ConfigError, CvcDepthError
+from cvcdepth_ros.bags import RecordingWriter
+from cvcdepth_ros.demo.node_report import read_report
+from cvcdepth_ros.demo.received import DIAGNOSTICS_TOPIC
+from cvcdepth_ros.process_setup import prepare_process
+
+# Room for every message of several sets, so that a moment without the processor loses nothing.
+_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.RELIABLE)
+_DIAGNOSTICS_TYPE = "diagnostic_msgs/msg/DiagnosticArray"
+_SPIN_SECONDS = 0.5
+
+_EXAMPLE = """example:
+  python -m cvcdepth_ros.demo.recorder OUTPUT --topic /surround_depth/points sensor_msgs/msg/PointCloud2
+
+On /diagnostics, which is always recorded, every report of --node is also printed as one line of JSON: what the node
+says of itself, how many messages of each topic have come, and "ready" once no message can be missed any more.
+"""
+
+
+class Recorder(Node):  # type: ignore[misc] # rclpy is not annotated
+    """Subscribes topics and writes what arrives; `tell` is called with a report whenever the watched node makes one."""
+
+    def __init__(
+        self, writer: RecordingWriter, topics: Mapping[str, str], watched: str, tell: Callable[[dict[str, Any]], None]
+    ) -> None:
+        super().__init__("demo_recorder")
+        self._writer = writer
+        self._watched = watched
+        self._tell = tell
+        self._unmatched = set(topics)
+        self.received = dict.fromkeys([*topics, DIAGNOSTICS_TOPIC], 0)
+        self.lost = dict.fromkeys(self.received, 0)
+        self.last_message = time.monotonic()
+        for topic, type_name in topics.items():
+            self._subscribe(topic, type_name)
+        # Last of all. DDS makes subscriptions known in their order, so whoever reaches this one knows the others.
+        self._subscribe(DIAGNOSTICS_TOPIC, _DIAGNOSTICS_TYPE)
+
+    def summary(self) -> dict[str, Any]:
+        """Say what has come, and which topics lost messages."""
+        return {"received": self.received, "lost": {topic: count for topic, count in self.lost.items() if count}}
+
+    def _subscribe(self, topic: str, type_name: str) -> Subscription:
+        self._writer.add_topic(topic, type_name)
+
+        def matched(event: Any) -> None:
+            if event.current_count:
+                self._unmatched.discard(topic)
+
+        def message_lost(event: Any) -> None:
+            self.lost[topic] += event.total_count_change
+
+        return self.create_subscription(
+            message_class(type_name),
+            topic,
+            partial(self._store, topic),
+            _QOS,
+            raw=True,
+            event_callbacks=SubscriptionEventCallbacks(matched=matched, message_lost=message_lost),
+        )
+
+    def _store(self, topic: str, cdr: bytes) -> None:
+        self._writer.write(topic, time.time_ns(), cdr)
+        self.received[topic] += 1
+        if topic == DIAGNOSTICS_TOPIC:
+            self._report(cdr)
+        else:
+            self.last_message = time.monotonic()
+
+    def _report(self, cdr: bytes) -> None:
+        """Pass on what the watched node says of itself.
+
+        That its message arrived means that its publishers know our subscriptions; together with ours knowing its
+        publishers, nothing that it publishes from now on can be missed.
+        """
+        report = read_report(deserialize_message(cdr, DiagnosticArray), self._watched)
+        if report is not None:
+            self._tell({"ready": not self._unmatched, "node": report.model_dump(), **self.summary()})
+
+
+def message_class(type_name: str) -> Any:
+    """Import the class of `package/msg/Name`; ConfigError when it is not installed."""
+    package, _, name = type_name.partition("/msg/")
+    try:
+        return getattr(import_module(f"{package}.msg"), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(f"message type '{type_name}' is not known: {error}") from error
+
+
+def record(output: Path, topics: Mapping[str, str], watched: str, idle_seconds: float) -> dict[str, Any]:
+    """Record until SIGINT or SIGTERM, or until nothing but diagnostics came for `idle_seconds`; return the summary."""
+    with RecordingWriter(output) as writer:
+        recorder = Recorder(writer, topics, watched, _print_line)
+        executor = SingleThreadedExecutor()
+        executor.add_node(recorder)
+        try:
+            while rclpy.ok() and time.monotonic() - recorder.last_message < idle_seconds:
+                executor.spin_once(timeout_sec=_SPIN_SECONDS)
+        except (KeyboardInterrupt, ExternalShutdownException):
+            pass
+        # A second signal must not cut the file.
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
+        recorder.destroy_node()
+    return recorder.summary()
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the recorder; return the exit code."""
+    options = _parse(arguments)
+    prepare_process()
+    rclpy.init(args=[])
+    try:
+        summary = record(options.output, dict(options.topic), options.node, options.idle_seconds)
+    except CvcDepthError as error:
+        print(f"recorder: {error}", file=sys.stderr)
+        return 1
+    finally:
+        rclpy.try_shutdown()
+    _print_line(summary)
+    return 0
+
+
+def _print_line(content: dict[str, Any]) -> None:
+    print(json.dumps(content), flush=True)
+
+
+def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="recorder", description=__doc__, epilog=_EXAMPLE, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("output", type=Path, help="folder of the recording; must not exist")
+    parser.add_argument("--topic", nargs=2, action="append", default=[], metavar=("NAME", "TYPE"), help="repeatable")
+    parser.add_argument("--node", default="/surround_depth", help="whose diagnostics are printed [%(default)s]")
+    parser.add_argument(
+        "--idle-seconds", type=float, default=60.0, help="end when no message came for so long [%(default)s]"
+    )
+    return parser.parse_args(arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

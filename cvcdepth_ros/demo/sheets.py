@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The demo's pictures: a contact sheet for every set that arrived, and the page that plays them."""
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from cvcdepth_core.errors import TransformError
+from cvcdepth_core.images import Picture
+from cvcdepth_core.rig import Rig
+from cvcdepth_core.visualization import Points, SurroundPictures, contact_sheet
+from cvcdepth_ros.demo.clouds import LidarSweeps
+from cvcdepth_ros.demo.page import Table, animation_page
+from cvcdepth_ros.demo.received import ReceivedSet
+from cvcdepth_ros.demo.result import UNTRAINED_WARNING, DemoResult
+from cvcdepth_ros.synchronizer import NANOSECONDS
+
+_JPEG_QUALITY = 85
+_PNG_COMPRESSION = 6
+
+
+class SheetWriter:
+    """Draws sets, writes each as PNG, and keeps a JPEG of each for the page."""
+
+    def __init__(self, rig: Rig, lidar: LidarSweeps, folder: Path, notes: list[str], untrained: bool) -> None:
+        """Draw for one rig and recording into `folder`; `notes` are the last lines below every picture."""
+        self._rig = rig
+        self._lidar = lidar
+        self._folder = folder
+        self._notes = notes
+        self._untrained = untrained
+        self.jpegs: list[bytes] = []
+
+    def write(self, received: Iterable[ReceivedSet], total: int) -> Iterator[Path]:
+        """Draw one set after the other; `total` is the number of sets that were sent. Gives the files."""
+        for surround in received:
+            sheet = self._draw(surround, total)
+            path = self._folder / f"set_{surround.sent.sequence + 1:03d}.png"
+            path.write_bytes(_encoded(sheet, ".png", cv2.IMWRITE_PNG_COMPRESSION, _PNG_COMPRESSION))
+            self.jpegs.append(_encoded(sheet, ".jpg", cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY))
+            yield path
+
+    def page(self, title: str, result: DemoResult) -> str:
+        """Return the HTML page of all that was written."""
+        tables: list[Table] = [("What became of it", result.counts()), ("Latency, ms: p50, p95", result.latencies())]
+        return animation_page(title, UNTRAINED_WARNING if self._untrained else "", self.jpegs, tables, self._notes)
+
+    def _draw(self, surround: ReceivedSet, total: int) -> Picture:
+        stamp = surround.sent.stamp_ns
+        points, note = self._sweep(surround)
+        shown = SurroundPictures(
+            surround.pictures,
+            surround.depth,
+            surround.cloud,
+            points,
+            title=f"Surround depth, computed live: set {surround.sent.sequence + 1} of {total}",
+            captions=[f"{note}; stamp {stamp // NANOSECONDS}.{stamp % NANOSECONDS:09d}", *self._notes],
+            warning=UNTRAINED_WARNING if self._untrained else "",
+        )
+        return contact_sheet(self._rig, shown)
+
+    def _sweep(self, surround: ReceivedSet) -> tuple[Points | None, str]:
+        """Return the LiDAR's points at the set's stamp, and what the caption says of them."""
+        seen = "Right: the scene from above, grid 10 m; the merged cloud in its own colours"
+        try:
+            points = self._lidar.nearest(surround.sent.stamp_ns, surround.sent.images[self._rig.anchor])
+        except TransformError as error:
+            return None, f"{seen}, no LiDAR ({error})"
+        return points, f"{seen}, {'LiDAR in cyan' if points is not None else 'no LiDAR recorded'}"
+
+
+def _encoded(picture: Picture, extension: str, option: int, value: int) -> bytes:
+    _, encoded = cv2.imencode(extension, np.ascontiguousarray(picture[..., ::-1]), [option, value])
+    return bytes(encoded)
