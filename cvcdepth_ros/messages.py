@@ -8,6 +8,7 @@ from rclpy's (`ros_message_factory`) or from those of rosbags' typestore (`bag_m
 import array
 import sys
 from collections.abc import Callable
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -154,13 +155,13 @@ class MessageFactory:
 
 def ros_message_factory() -> MessageFactory:
     """Build rclpy's messages; needs a ROS environment."""
-    from importlib import import_module
+    return MessageFactory(ros_message_class, _to_byte_array)
 
-    def find_class(type_name: str) -> Any:
-        package, _, name = type_name.split("/")
-        return getattr(import_module(f"{package}.msg"), name)
 
-    return MessageFactory(find_class, _to_byte_array)
+def ros_message_class(type_name: str) -> Any:
+    """Find rclpy's class of a type like `sensor_msgs/msg/Image`; ImportError or AttributeError when there is none."""
+    package, _, name = type_name.split("/")
+    return getattr(import_module(f"{package}.msg"), name)
 
 
 def bag_message_factory() -> MessageFactory:

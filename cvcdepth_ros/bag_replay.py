@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Work with recordings of surround cameras: describe their rig, compute depth, play them live."""
+
+import argparse
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from cvcdepth_core.errors import CvcDepthError
+from cvcdepth_ros.commands import play, rig, run
+from cvcdepth_ros.version import package_version
+
+
+class Command(Protocol):
+    """What each module of `cvcdepth_ros.commands` offers."""
+
+    SUMMARY: str
+    """One line for the list of commands; what may follow is for the command's own help."""
+    EXAMPLES: tuple[str, ...]
+    """Command lines, without the program's name."""
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Declare the options, importing nothing heavy."""
+
+    def execute(self, arguments: argparse.Namespace) -> None:
+        """Do the work; CvcDepthError says why it failed. `arguments.usage_error(text)` ends it as wrong use."""
+
+
+COMMANDS: Mapping[str, Command] = {"rig": rig, "run": run, "play": play}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command and return the exit code: 0, or 1 when the job failed. Wrong use ends by SystemExit(2)."""
+    program = "cvcdepth" if Path(sys.argv[0]).name == "cvcdepth" else "bag_replay"
+    try:
+        parsed = build_parser(program).parse_args(arguments)
+        parsed.execute(parsed)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # Whoever read our output (`| head`) is gone; without this the interpreter complains once more when it ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except (CvcDepthError, OSError) as error:
+        return _fail(program, str(error))
+    except KeyboardInterrupt:
+        return _fail(program, "interrupted")
+    return 0
+
+
+def build_parser(program: str) -> argparse.ArgumentParser:
+    """Build the parser of all commands; `program` is what the help calls it."""
+    parser = argparse.ArgumentParser(**_texts(program, str(__doc__), [f"{name} --help" for name in COMMANDS]))
+    parser.add_argument("--version", action="version", version=f"%(prog)s {package_version()}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    for name, command in COMMANDS.items():
+        headline = command.SUMMARY.splitlines()[0]
+        subparser = commands.add_parser(
+            name, help=headline, **_texts(f"{program} {name}", command.SUMMARY, command.EXAMPLES)
+        )
+        command.add_arguments(subparser)
+        subparser.set_defaults(execute=command.execute, usage_error=subparser.error)
+    return parser
+
+
+def _texts(program: str, description: str, examples: Sequence[str]) -> dict[str, Any]:
+    lines = "".join(f"\n  {program.split()[0]} {example}" for example in examples)
+    return {
+        "prog": program,
+        "description": description,
+        "epilog": f"examples:{lines}",
+        "formatter_class": argparse.RawDescriptionHelpFormatter,
+    }
+
+
+def _fail(program: str, reason: str) -> int:
+    print(f"{program}: {' '.join(reason.split())}", file=sys.stderr)
+    return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Options and output that several commands have in common."""
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+
+def add_recording(parser: argparse.ArgumentParser) -> None:
+    """Declare the recording."""
+    parser.add_argument(
+        "recording", type=Path, metavar="BAG", help="rosbag2 folder, or a single .mcap, .db3 or ROS 1 .bag file"
+    )
+
+
+def add_window(parser: argparse.ArgumentParser) -> None:
+    """Declare the part of the recording that is wanted."""
+    parser.add_argument(
+        "--start", type=non_negative, default=0.0, metavar="S", help="seconds of the recording to skip [0]"
+    )
+    parser.add_argument("--duration", type=positive, metavar="S", help="seconds of the recording to take [to its end]")
+
+
+def add_json(parser: argparse.ArgumentParser) -> None:
+    """Declare `--json`."""
+    parser.add_argument("--json", action="store_true", help="print the result as one JSON document")
+
+
+def window_ns(arguments: argparse.Namespace, recording_start: int) -> tuple[int, int | None]:
+    """Return first and last (exclusive; None: the end) log time in nanoseconds, from the options of `add_window`."""
+    start = recording_start + round(arguments.start * 1e9)
+    return start, None if arguments.duration is None else start + round(arguments.duration * 1e9)
+
+
+def print_result(result: dict[str, Any], text: str, as_json: bool) -> None:
+    """Print the result on stdout, for machines or for people."""
+    print(json.dumps(result, indent=2) if as_json else text)
+
+
+def warn(text: str) -> None:
+    """Tell something on stderr that does not end the command."""
+    print(f"warning: {text}", file=sys.stderr)
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Lay out columns as wide as their widest cell."""
+    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
+    lines = ("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in (header, *rows))
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def positive(text: str) -> float:
+    """Parse a number above zero."""
+    number = non_negative(text)
+    if number == 0:
+        raise argparse.ArgumentTypeError("must be above 0")
+    return number
+
+
+def non_negative(text: str) -> float:
+    """Parse a number of at least zero."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not 0 <= number < math.inf:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number of at least 0")
+    return number

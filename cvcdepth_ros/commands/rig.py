@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`rig`: describe the cameras of a recording in a rig file."""
+
+import argparse
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cvcdepth_core.errors import ConfigError
+from cvcdepth_ros.commands.arguments import add_json, add_recording, print_result, table
+from cvcdepth_ros.version import package_version
+
+if TYPE_CHECKING:
+    from cvcdepth_core.rig import Camera, Rig, RigLayout
+
+SUMMARY = """Write a rig file from a recording.
+
+Finds the cameras, takes their calibrations from camera_info and their poses from /tf_static, orders them
+counter-clockwise around the vehicle from the front one, and computes which of them see the same space."""
+EXAMPLES: tuple[str, ...] = (
+    "rig drive.mcap",
+    "rig drive/ -o rigs/shuttle.yaml --base-frame base_footprint --anchor front",
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_recording(parser)
+    parser.add_argument(
+        "-o", "--output", type=Path, default=Path("rig.yaml"), metavar="FILE", help="rig file to write [rig.yaml]"
+    )
+    parser.add_argument("--base-frame", default="base_link", metavar="FRAME", help="the vehicle's frame [base_link]")
+    parser.add_argument("--anchor", metavar="NAME", help="camera whose stamp a set carries [the front one]")
+    parser.add_argument("--force", action="store_true", help="overwrite the rig file")
+    add_json(parser)
+
+
+def execute(arguments: argparse.Namespace) -> None:
+    """Write the rig file and show what is in it."""
+    from cvcdepth_core.rig import save_rig_layout
+    from cvcdepth_ros.bags import open_recording
+    from cvcdepth_ros.recorded_rig import discover_rig
+
+    if arguments.output.exists() and not arguments.force:
+        raise ConfigError(f"{arguments.output}: exists already; --force overwrites it")
+    with open_recording(arguments.recording) as recording:
+        layout = discover_rig(recording, arguments.base_frame)
+    layout = layout.model_copy(update={"anchor": _anchor(layout, arguments.anchor)})
+    result = _describe(layout, layout.complete())
+    source = f"bag_replay rig {package_version()}, from the recording {arguments.recording.resolve().name}"
+    save_rig_layout(arguments.output, layout, f"Written by {source}.\n{_overlaps_text(result)}")
+    result = {"file": str(arguments.output), "recording": str(arguments.recording), **result}
+    print_result(result, _text(result), arguments.json)
+
+
+def _anchor(layout: "RigLayout", wanted: str | None) -> str:
+    if wanted is not None and wanted not in layout.names:
+        raise ConfigError(f"anchor: no camera is called {wanted}; there are {', '.join(layout.names)}")
+    return wanted or layout.anchor_camera
+
+
+def _describe(layout: "RigLayout", rig: "Rig") -> dict[str, Any]:
+    return {
+        "base_frame": rig.base_frame,
+        "anchor": rig.anchor,
+        "cameras": [
+            {"name": camera.name, "image_topic": entry.image_topic, "frame_id": entry.frame_id, **_view(camera)}
+            for entry, camera in zip(layout.cameras, rig.cameras, strict=True)
+        ],
+        "overlaps": [
+            {
+                "camera": overlap.camera,
+                "neighbour": overlap.neighbour,
+                "degrees": round(overlap.angle, 2),
+                "are_neighbours": overlap.neighbour in rig.neighbours[overlap.camera],
+            }
+            for overlap in rig.overlaps
+        ],
+    }
+
+
+def _view(camera: "Camera") -> dict[str, Any]:
+    """Where the camera looks, how widely, and what its pictures are like."""
+    calibration = camera.calibration
+    axis = camera.base_T_camera[:3, 2]
+    (fx, _, cx), (width, height) = calibration.rectified_intrinsics[0], calibration.image_size
+    view = math.atan((width - 0.5 - cx) / fx) + math.atan((cx + 0.5) / fx)
+    return {
+        "yaw_degrees": round(math.degrees(math.atan2(axis[1], axis[0])), 2),
+        "horizontal_view_degrees": round(math.degrees(view), 2),
+        "width": width,
+        "height": height,
+        "distortion": calibration.distortion_model if any(calibration.d) else "none",
+        "rectified": camera.rectified,
+    }
+
+
+def _text(result: dict[str, Any]) -> str:
+    cameras = [
+        (
+            camera["name"],
+            f"{camera['yaw_degrees']:.1f}",
+            f"{camera['horizontal_view_degrees']:.1f}",
+            f"{camera['width']}x{camera['height']}",
+            "rectified" if camera["rectified"] else camera["distortion"],
+            camera["image_topic"],
+        )
+        for camera in result["cameras"]
+    ]
+    header = ("camera", "yaw (deg)", "view (deg)", "size", "distortion", "images")
+    return (
+        f"{table(header, cameras)}\n\n{_overlaps_text(result)}\n\n"
+        f"base frame {result['base_frame']}, anchor camera {result['anchor']}; written to {result['file']}"
+    )
+
+
+def _overlaps_text(result: dict[str, Any]) -> str:
+    lines = [
+        f"  {overlap['camera']} - {overlap['neighbour']}: {overlap['degrees']:.1f}"
+        f"{'' if overlap['are_neighbours'] else ' (too narrow: no neighbours)'}"
+        for overlap in result["overlaps"]
+    ]
+    return "\n".join(["Shared view, in degrees of the first camera's width:", *(lines or ["  none"])])

@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The rig of a recording: its cameras found, or a rig file's completed, from CameraInfo and `/tf_static`."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from pydantic import ValidationError
+
+from cvcdepth_core.calibration import first_validation_message
+from cvcdepth_core.errors import RecordingError, RigError, TransformError
+from cvcdepth_core.rig import CameraEntry, RigLayout
+from cvcdepth_ros.bags import Recording
+from cvcdepth_ros.camera_discovery import CAMERA_INFO_TYPE, COMPRESSED_IMAGE_TYPE, IMAGE_TYPE, discover_cameras
+from cvcdepth_ros.rig_assembly import RigAssembler
+
+STATIC_TRANSFORMS = "/tf_static"
+
+_IMAGE_TYPES = (IMAGE_TYPE, COMPRESSED_IMAGE_TYPE)
+
+
+def discover_rig(recording: Recording, base_frame: str = "base_link") -> RigLayout:
+    """Find the recording's cameras and return them complete, ordered around the vehicle from the front one.
+
+    Raises RecordingError when there are fewer than two, and RigError or TransformError, naming the recording and the
+    camera, for the first that is not calibrated or has no transform to `base_frame`.
+    """
+    try:
+        entries = discover_cameras({topic.name: topic.type for topic in recording.topics.values() if topic.count})
+        if len(entries) < 2:
+            raise RecordingError(f"{recording.path}: {_too_few(entries, recording)}")
+        layout = RigLayout(base_frame=base_frame, cameras=tuple(entries))
+    except ValidationError as error:
+        raise RecordingError(f"{recording.path}: its cameras make no rig: {first_validation_message(error)}") from error
+    return assemble_rig(recording, layout).completed_layout()
+
+
+def assemble_rig(recording: Recording, layout: RigLayout) -> RigAssembler:
+    """Complete `layout` with each camera's first CameraInfo and the static transforms of the whole recording.
+
+    Raises RecordingError when a topic that the layout needs is not in the recording or is of another type; RigError or
+    TransformError, naming the recording and the camera, for the first that stays incomplete.
+    """
+    for problem in _topic_problems(recording, layout):
+        raise RecordingError(f"{recording.path}: {problem}")
+    assembler = RigAssembler(layout)
+    _add_first_camera_infos(assembler, recording)
+    _add_static_transforms(assembler, recording)
+    for problem in assembler.problems().values():
+        raise RigError(f"{recording.path}: {problem}")
+    return assembler
+
+
+def add_camera_info(assembler: RigAssembler, topic: str, message: Any) -> bool:
+    """Hand a CameraInfo to every camera of that topic; return whether it says anything new."""
+    cameras = [camera.name for camera in assembler.layout.cameras if camera.camera_info_topic == topic]
+    return True in [assembler.add_camera_info(camera, message) for camera in cameras]
+
+
+def _add_first_camera_infos(assembler: RigAssembler, recording: Recording) -> None:
+    awaited = {camera.camera_info_topic for camera in assembler.layout.cameras} & recording.topics.keys()
+    for message in recording.messages(awaited):
+        if message.topic in awaited:
+            add_camera_info(assembler, message.topic, recording.deserialize(message))
+            awaited.remove(message.topic)
+        if not awaited:
+            return
+
+
+def _add_static_transforms(assembler: RigAssembler, recording: Recording) -> None:
+    if STATIC_TRANSFORMS not in recording.topics:
+        return
+    for message in recording.messages([STATIC_TRANSFORMS]):
+        try:
+            assembler.transforms.add_message(recording.deserialize(message))
+        except TransformError as error:
+            raise TransformError(f"{recording.path}: {STATIC_TRANSFORMS}: {error}") from error
+
+
+def _topic_problems(recording: Recording, layout: RigLayout) -> Iterator[str]:
+    """Say what is wrong with the topics that the cameras need, camera by camera."""
+    for camera in layout.cameras:
+        problem = _topic_problem(recording, camera.image_topic, _IMAGE_TYPES)
+        if problem is None and (camera.calibration is None or camera.frame_id is None):
+            problem = _topic_problem(recording, camera.camera_info_topic, (CAMERA_INFO_TYPE,))
+        if problem is not None:
+            yield f"camera {camera.name}: {problem}"
+
+
+def _topic_problem(recording: Recording, name: str, types: Sequence[str]) -> str | None:
+    topic = recording.topics.get(name)
+    if topic is None:
+        others = [other.name for other in recording.topics.values() if other.type in types]
+        return f"no topic {name}; of type {' or '.join(types)} there are {', '.join(others) or 'none'}"
+    if topic.type not in types:
+        return f"{name} carries {topic.type}, want {' or '.join(types)}"
+    return None if topic.count else f"no message on {name}"
+
+
+def _too_few(entries: Sequence[CameraEntry], recording: Recording) -> str:
+    infos = [topic.name for topic in recording.topics.values() if topic.type == CAMERA_INFO_TYPE]
+    images = [topic.name for topic in recording.topics.values() if topic.type in _IMAGE_TYPES]
+    return (
+        f"a surround rig needs two cameras, found {len(entries)}: a camera is a namespace with a camera_info and an "
+        f"image topic; camera_info: {', '.join(infos) or 'none'}; images: {', '.join(images) or 'none'}"
+    )
