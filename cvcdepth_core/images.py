@@ -35,7 +35,7 @@ _TO_RGB = {
     "bayer_gbrg8": cv2.COLOR_BayerGBRG2RGB,
     "bayer_grbg8": cv2.COLOR_BayerGRBG2RGB,
 }
-_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+_JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
 _PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 
 
@@ -62,35 +62,51 @@ def decode_raw(
 def decode_compressed(image_format: str, content: Any, camera: str) -> Picture:
     """Decode a `sensor_msgs/CompressedImage` (JPEG or PNG) to an RGB picture.
 
-    What the bytes are decides, not `image_format`, whose text differs from driver to driver. ImageError names the
-    camera for another format and for a file that was cut, which decoders would silently fill with grey.
+    What the bytes are decides, not `image_format`, whose text differs from driver to driver; only a Bayer pattern is
+    taken from it, since image_transport compresses mosaics as grey pictures ("bayer_rggb8; png compressed").
+    ImageError names the camera for another format and for a file that was cut, which decoders may fill with grey.
     """
-    encoded = np.frombuffer(content, dtype=np.uint8)
-    head, tail = encoded[:8].tobytes(), encoded[-64:].tobytes()
-    if head.startswith(_JPEG_START):
-        complete = _JPEG_END in tail
-    elif head == _PNG_START:
-        complete = _PNG_END in tail
+    encoded = bytes(content)
+    if encoded.startswith(_JPEG_START):
+        complete = _jpeg_is_complete(encoded)
+    elif encoded.startswith(_PNG_START):
+        complete = encoded.rfind(_PNG_END) > 0
     else:
         raise ImageError(
-            f"camera {camera}: compressed image with format '{image_format}' begins with {head.hex(' ') or 'nothing'}: "
-            "neither JPEG nor PNG"
+            f"camera {camera}: compressed image with format '{image_format}' begins with "
+            f"{encoded[:8].hex(' ') or 'nothing'}: neither JPEG nor PNG"
         )
     if not complete:
-        raise ImageError(f"camera {camera}: compressed image of {encoded.size} bytes has no end: it was cut")
-    picture = _imdecode(encoded)
+        raise ImageError(f"camera {camera}: compressed image of {len(encoded)} bytes has no end: it was cut")
+    picture = _imdecode(encoded, _compressed_encoding(image_format))
     if picture is None:
-        raise ImageError(f"camera {camera}: compressed image of {encoded.size} bytes is damaged")
+        raise ImageError(f"camera {camera}: compressed image of {len(encoded)} bytes is damaged")
     return picture
 
 
-def _imdecode(encoded: NDArray[np.uint8]) -> Picture | None:
+def _jpeg_is_complete(encoded: bytes) -> bool:
+    """Whether the last scan ends. Drivers pad files with zeros, and a thumbnail has an end of its own before it."""
+    end = encoded.rfind(_JPEG_END)
+    return end >= 0 and encoded.find(_JPEG_SCAN, end) < 0
+
+
+def _compressed_encoding(image_format: str) -> str:
+    """Say what the decoder will give: a mosaic for image_transport's "bayer_X; jpeg compressed", else bgr8."""
+    original, _, coding = image_format.partition(";")
+    mosaic = original.strip().replace("16", "8")
+    is_mosaic = mosaic.startswith("bayer_") and mosaic in _TO_RGB and coding.strip().endswith("compressed")
+    return mosaic if is_mosaic else "bgr8"
+
+
+def _imdecode(encoded: bytes, encoding: str) -> Picture | None:
+    """Decode to RGB; what the decoder gives is BGR, or a mosaic where `encoding` is a Bayer pattern."""
+    # The sensor's rows stay rows: an orientation tag would contradict the calibration.
+    flags = (cv2.IMREAD_COLOR if encoding == "bgr8" else cv2.IMREAD_GRAYSCALE) | cv2.IMREAD_IGNORE_ORIENTATION
     try:
-        # The sensor's rows stay rows: an orientation tag would contradict the calibration.
-        picture: Picture | None = cv2.imdecode(encoded, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
+        decoded = cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), flags)
     except cv2.error:
         return None
-    return picture
+    return None if decoded is None else _to_rgb(decoded, encoding)
 
 
 def _rows_to_rgb(rows: NDArray[np.uint8], encoding: str, is_bigendian: bool) -> Picture:
@@ -98,9 +114,11 @@ def _rows_to_rgb(rows: NDArray[np.uint8], encoding: str, is_bigendian: bool) -> 
         rows, encoding = _upper_bytes(rows, is_bigendian), encoding.replace("16UC1", "mono8").replace("16", "8")
     channels = _CHANNELS[encoding]
     image = rows.reshape(rows.shape[0], -1, channels) if channels > 1 else rows
-    if encoding == "rgb8":
-        return np.ascontiguousarray(image)
-    rgb: Picture = cv2.cvtColor(np.ascontiguousarray(image), _TO_RGB[encoding])
+    return np.ascontiguousarray(image) if encoding == "rgb8" else _to_rgb(np.ascontiguousarray(image), encoding)
+
+
+def _to_rgb(image: NDArray[np.uint8], encoding: str) -> Picture:
+    rgb: Picture = cv2.cvtColor(image, _TO_RGB[encoding])
     return rgb
 
 

@@ -27,7 +27,8 @@ class Rectifier:
     """Takes one camera's raw pictures to rectified ones of `height` x `width` pixels.
 
     `intrinsics` [3, 3] float64 belong to the rectified, resized picture, in its pixels (centres at the integers).
-    `visible`, bool [height, width], is False where the rectified picture shows nothing of the raw one.
+    `visible`, bool [height, width], is False where the rectified picture shows nothing of the raw one: outside it, and
+    beyond the angle up to which the distortion model holds.
     """
 
     def __init__(self, calibration: Calibration, height: int, width: int, rectified: bool = False) -> None:
@@ -40,6 +41,8 @@ class Rectifier:
         x, y = _sampling_maps(calibration, self.intrinsics, (width, height), rectified)
         inside = (x >= -0.5) & (x <= image_width - 0.5) & (y >= -0.5) & (y <= image_height - 0.5)
         self.visible: NDArray[np.bool_] = self._average(255 * inside.astype(np.uint8)) == 255
+        if not rectified:
+            self.visible &= _ray_radii(calibration, self.intrinsics, (width, height)) < _unfolded_radius(calibration)
         self._maps = cv2.convertMaps(x, y, cv2.CV_16SC2)
 
     def __call__(self, picture: Picture, camera: str) -> Picture:
@@ -128,6 +131,35 @@ def _sampling_maps(
     build = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
     x, y = build(source, distortion, rotation, fine, (size[0] * ox, size[1] * oy), cv2.CV_32FC1)
     return x, y
+
+
+def _ray_radii(calibration: Calibration, intrinsics: NDArray[np.float64], size: tuple[int, int]) -> NDArray[np.float64]:
+    """Distance [H, W] of each network pixel's ray from the raw camera's axis at z = 1; inf behind the camera."""
+    u, v = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
+    raw_from_pixels = calibration.rotation.T @ np.linalg.inv(intrinsics)
+    x, y, z = np.tensordot(raw_from_pixels, np.stack([u, v, np.ones_like(u)]), axes=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        radii: NDArray[np.float64] = np.where(z > 0, np.hypot(x, y) / z, np.inf)
+    return radii
+
+
+def _unfolded_radius(calibration: Calibration) -> float:
+    """Radius at z = 1 up to which the distorted radius grows, inf where it always does.
+
+    A distortion polynomial turns back beyond the angles it was fitted to and would show the picture a second time.
+    """
+    radii = np.tan(np.linspace(0.0, 0.5 * math.pi, 2000, endpoint=False))
+    points = np.stack([radii, np.zeros_like(radii), np.ones_like(radii)], axis=1)[:, None]
+    origin = np.zeros(3)
+    if calibration.distortion_model == "equidistant":
+        projected, _ = cv2.fisheye.projectPoints(points, origin, origin, np.eye(3), calibration.distortion)
+    else:
+        # Only the radial part folds; the small tangential, prism and tilt terms would tilt the axis looked along.
+        radial = calibration.distortion.copy()
+        radial[[2, 3, *range(8, len(radial))]] = 0.0
+        projected, _ = cv2.projectPoints(points, origin, origin, np.eye(3), radial)
+    shrinks = np.flatnonzero(np.diff(projected[:, 0, 0]) <= 0)
+    return float(radii[shrinks[0]]) if shrinks.size else math.inf
 
 
 def _oversampling(pixels_per_network_pixel: float) -> int:

@@ -239,7 +239,7 @@ def _image_outline(camera: Camera) -> NDArray[np.float64]:
 
 
 def _image_sides(camera: Camera) -> NDArray[np.float64]:
-    """Return the normals [4, 3] of the planes through the optical centre and the image's sides; they point into the view."""
+    """Return the inward normals [4, 3] of the planes through the optical centre and the image's sides."""
     corners = _image_outline(camera)
     return np.cross(corners, np.roll(corners, -1, axis=0))
 
