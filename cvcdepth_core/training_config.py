@@ -145,6 +145,8 @@ def _describe(item: Mapping[str, Any]) -> str:
     name = ".".join(map(str, item["loc"]))
     if item["type"] == "extra_forbidden":
         return f"{name} is no known field; {_known_fields(item['loc'])}"
+    if item["type"] == "missing":
+        return f"{name} is missing"
     if not name:
         return str(item["msg"])
     return f"{name} is {item['input']!r}: {item['msg']}"
