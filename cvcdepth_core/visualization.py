@@ -40,7 +40,7 @@ _TICKS = (1, 2, 5, 10, 20, 40, 80, 160)
 class DepthScale:
     """Which depths have which colour: logarithmic from `near` (red) to `far` (dark blue), both in metres."""
 
-    near: float = 2.0
+    near: float = 1.0
     far: float = 80.0
 
     def __post_init__(self) -> None:
@@ -184,7 +184,7 @@ def _camera_tiles(rig: Rig, shown: SurroundPictures, scale: DepthScale) -> Pictu
 def _legend(scale: DepthScale, width: int) -> Picture:
     """Draw the colour bar over its ticks in metres."""
     legend = _filled(72, width, _BACKGROUND)
-    bar_left, bar_right, top, bottom = 250, width - 180, 12, 34
+    bar_left, bar_right, top, bottom = 340, width - 180, 12, 34
     span = np.linspace(0.0, 1.0, bar_right - bar_left)
     depths = scale.near * (scale.far / scale.near) ** span
     legend[top:bottom, bar_left:bar_right] = scale.colours(depths.astype(np.float32))
@@ -192,7 +192,7 @@ def _legend(scale: DepthScale, width: int) -> Picture:
         column = bar_left + round((bar_right - bar_left - 1) * math.log(tick / scale.near, scale.far / scale.near))
         cv2.line(legend, (column, bottom), (column, bottom + 6), _QUIET_TEXT, 1)
         _write(legend, f"{tick:g} m", (column, bottom + 28), centred=True)
-    _write(legend, "depth along the axis", (0, bottom - 4), colour=_TEXT)
+    _write(legend, "depth along each camera's axis", (0, bottom - 4), colour=_TEXT)
     _write(legend, "black: unknown", (bar_right + 24, bottom - 4))
     return legend
 

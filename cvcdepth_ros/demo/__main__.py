@@ -8,6 +8,7 @@ demo.html, demo.json, the recording of the node's outputs, the rig file, the nod
 import argparse
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +21,10 @@ from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.commands.arguments import positive
 from cvcdepth_ros.demo.clouds import LidarSweeps
 from cvcdepth_ros.demo.live_run import LiveOutcome, LiveRun
+from cvcdepth_ros.demo.pace import manageable_rate
 from cvcdepth_ros.demo.paths import DemoPaths
 from cvcdepth_ros.demo.processes import children
-from cvcdepth_ros.demo.received import Output, ReceivedSets, SentSet, node_outputs, sent_sets
+from cvcdepth_ros.demo.received import Output, ReceivedSets, node_outputs, sent_sets
 from cvcdepth_ros.demo.result import UNTRAINED_WARNING, DemoResult
 from cvcdepth_ros.demo.sheets import SheetWriter
 from cvcdepth_ros.version import package_version
@@ -63,92 +65,95 @@ def run(options: argparse.Namespace) -> DemoResult:
     with children(paths.logs) as family:
         live = LiveRun(family, paths, NODE)
         live.write_rig(options.recording)
-        layout = load_rig_layout(paths.rig)
-        parameters = _write_parameters(options, paths)
-        outputs = node_outputs(NODE, layout.names, layout.anchor_camera)
-        outcome = live.play(options.recording, options.rate, options.duration, outputs)
-    result = _show(options, paths, layout, outputs, outcome, parameters)
+        setup = Setup.of(options, paths)
+        setup.write_parameters(paths)
+        rate = options.rate or setup.manageable_rate()
+        print(f"playing {setup.recording.name} at {rate:.3g} times real time")
+        outcome = live.play(setup.recording, rate, options.duration, setup.outputs)
+    result = _show(setup, paths, outcome)
     print(f"\n{result.text()}\n\npictures  {paths.sheets}\npage      {paths.page}\nresult    {paths.result}")
     if result.untrained:
         print(UNTRAINED_WARNING)
     return result
 
 
-def _show(
-    options: argparse.Namespace,
-    paths: DemoPaths,
-    layout: RigLayout,
-    outputs: Sequence[Output],
-    outcome: LiveOutcome,
-    parameters: dict[str, Any],
-) -> DemoResult:
-    """Draw what arrived, count it, and write pictures, page and result."""
-    with open_recording(options.recording) as recording:
-        sets = sent_sets(recording, layout, _TOLERANCE_SECONDS, outcome.sent)
-        received = ReceivedSets(paths.recording, outputs, sets)
-        notes = _notes(options, outcome, parameters)
-        lidar = LidarSweeps(recording, layout.base_frame)
-        writer = SheetWriter(layout.complete(), lidar, paths.sheets, notes, not options.checkpoint)
-        for _ in tqdm(writer.write(received, len(sets)), desc="drawing", total=outcome.node.published, unit=" sets"):
+@dataclass(frozen=True)
+class Setup:
+    """What is played, and how the node is set up for it."""
+
+    recording: Path
+    layout: RigLayout
+    parameters: dict[str, Any]
+    """The node's."""
+    outputs: list[Output]
+
+    @classmethod
+    def of(cls, options: argparse.Namespace, paths: DemoPaths) -> "Setup":
+        """Set up for the rig file that was written before."""
+        layout = load_rig_layout(paths.rig)
+        if options.checkpoint:
+            network: dict[str, Any] = {"checkpoint": str(options.checkpoint.absolute())}
+        else:
+            network = {"untrained": True, "height": options.height, "width": options.width}
+        parameters = {
+            "use_sim_time": True,
+            "rig": str(paths.rig.absolute()),
+            "tolerance": _TOLERANCE_SECONDS,
+            # Best-effort images are lost on a busy machine, where reliable ones make the player wait.
+            "reliable": True,
+            **network,
+        }
+        return cls(options.recording, layout, parameters, node_outputs(NODE, layout.names, layout.anchor_camera))
+
+    @property
+    def untrained(self) -> bool:
+        """Whether the network has random weights."""
+        return "checkpoint" not in self.parameters
+
+    def write_parameters(self, paths: DemoPaths) -> None:
+        """Write the node's parameter file."""
+        content = {NODE.lstrip("/"): {"ros__parameters": self.parameters}}
+        paths.parameters.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+
+    def manageable_rate(self) -> float:
+        """Measure how fast the recording may be played here."""
+        with open_recording(self.recording) as recording:
+            return manageable_rate(recording, self.layout, self.parameters)
+
+    def notes(self, outcome: LiveOutcome) -> list[str]:
+        """Return the lines below every picture."""
+        is_sample = self.recording.resolve() == SAMPLE
+        source = _SAMPLE_CREDIT if is_sample else f"Recording: {self.recording.name}"
+        return [f"Network: {outcome.node.model or 'none ran'}. {source}"]
+
+
+def _show(setup: Setup, paths: DemoPaths, outcome: LiveOutcome) -> DemoResult:
+    """Draw what arrived, count it, and write pictures, result and page."""
+    with open_recording(setup.recording) as recording:
+        sets = sent_sets(recording, setup.layout, _TOLERANCE_SECONDS, outcome.sent)
+        received = ReceivedSets(paths.recording, setup.outputs, sets)
+        lidar = LidarSweeps(recording, setup.layout.base_frame)
+        writer = SheetWriter(setup.layout.complete(), lidar, paths.sheets, setup.notes(outcome), setup.untrained)
+        for _ in tqdm(writer.write(received, len(sets)), desc="drawing", total=outcome.node.published, disable=None):
             pass
-    result = _result(options, layout, sets, received, outcome, parameters, len(writer.jpegs))
+    result = DemoResult(
+        version=package_version(),
+        recording=str(setup.recording),
+        rate=outcome.rate,
+        parameters=setup.parameters,
+        untrained=setup.untrained,
+        sent=len(sets),
+        received=len(writer.jpegs),
+        incomplete={sequence + 1: topics for sequence, topics in received.missing.items()},
+        node=outcome.node,
+        images_sent=sum(outcome.sent.get(camera.image_topic, 0) for camera in setup.layout.cameras),
+        messages_received=outcome.received,
+        messages_lost=outcome.lost,
+    )
     paths.result.write_text(result.model_dump_json(indent=2) + "\n", encoding="utf-8")
     if writer.jpegs:
         paths.page.write_text(writer.page("Surround depth, computed live", result), encoding="utf-8")
     return result
-
-
-def _result(
-    options: argparse.Namespace,
-    layout: RigLayout,
-    sets: Sequence[SentSet],
-    received: ReceivedSets,
-    outcome: LiveOutcome,
-    parameters: dict[str, Any],
-    complete: int,
-) -> DemoResult:
-    return DemoResult(
-        version=package_version(),
-        recording=str(options.recording),
-        rate=options.rate,
-        parameters=parameters,
-        untrained=not options.checkpoint,
-        sent=len(sets),
-        received=complete,
-        incomplete={sequence + 1: topics for sequence, topics in received.missing.items()},
-        node=outcome.node,
-        images_sent=sum(outcome.sent.get(camera.image_topic, 0) for camera in layout.cameras),
-        messages_received=outcome.received,
-        messages_lost=outcome.lost,
-    )
-
-
-def _write_parameters(options: argparse.Namespace, paths: DemoPaths) -> dict[str, Any]:
-    """Write the node's parameter file, and return the parameters."""
-    network = (
-        {"checkpoint": str(options.checkpoint.absolute())}
-        if options.checkpoint
-        else {"untrained": True, "height": options.height, "width": options.width}
-    )
-    parameters = {
-        "use_sim_time": True,
-        "rig": str(paths.rig.absolute()),
-        "tolerance": _TOLERANCE_SECONDS,
-        # On a busy machine best-effort images are lost where the player would wait with reliable ones.
-        "reliable": True,
-        **network,
-    }
-    content = {NODE.lstrip("/"): {"ros__parameters": parameters}}
-    paths.parameters.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
-    return parameters
-
-
-def _notes(options: argparse.Namespace, outcome: LiveOutcome, parameters: dict[str, Any]) -> list[str]:
-    """Return the lines below every picture."""
-    size = f", {parameters['height']} x {parameters['width']}" if not options.checkpoint else ""
-    is_sample = options.recording.resolve() == SAMPLE
-    source = _SAMPLE_CREDIT if is_sample else f"Recording: {options.recording.name}"
-    return [f"Network: {outcome.node.model or 'none ran'}{size}. {source}"]
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -161,8 +166,8 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--rate",
         type=positive,
-        default=0.05,
-        help="seconds of the recording per second; slow, so that a processor manages every set [%(default)s]",
+        metavar="R",
+        help="how many times real time [what this machine manages without dropping a set, measured]",
     )
     parser.add_argument(
         "--duration", type=positive, default=10.0, help="seconds of the recording, at most [%(default)s]"

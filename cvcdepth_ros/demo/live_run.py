@@ -23,6 +23,8 @@ _EQUAL_REPORTS = 2
 class LiveOutcome:
     """What the processes said at the end."""
 
+    rate: float
+    """How many times real time it was played."""
     sent: dict[str, int]
     """By topic: messages that the player published."""
     received: dict[str, int]
@@ -58,7 +60,7 @@ class LiveRun:
         self._follow(player)
         self._equal_reports = 0
         wait_until("for the node to finish its last set", self._settled, _SETTLE_SECONDS)
-        return self._end(player)
+        return self._end(player, rate)
 
     def _start_recorder(self, outputs: Sequence[Output]) -> Child:
         topics = [argument for output in outputs for argument in ("--topic", output.topic, output.type_name)]
@@ -73,17 +75,18 @@ class LiveRun:
 
     def _follow(self, player: Child) -> None:
         """Wait for the player's end, showing how many sets have been published."""
-        with tqdm(desc="playing", unit=" sets", bar_format="{desc}: {n_fmt} sets published, {elapsed}") as bar:
+        with tqdm(desc="playing", bar_format="{desc}: {n_fmt} sets published, {elapsed}", disable=None) as bar:
             while not player.ended():
                 self._read_reports()
                 bar.update(self._published() - bar.n)
 
-    def _end(self, player: Child) -> LiveOutcome:
+    def _end(self, player: Child, rate: float) -> LiveOutcome:
         """Stop the recorder, which then says what it has."""
         self._recorder.stop()
         self._recorder.ended()
         summary = list(self._recorder.reports(0.0))[-1]
         return LiveOutcome(
+            rate=rate,
             sent=player.result()["published"],
             received=summary["received"],
             lost=summary["lost"],

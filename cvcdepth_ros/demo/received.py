@@ -90,7 +90,7 @@ class ReceivedSets:
         self._outputs = {output.topic: output for output in outputs}
         self._set_of = {(output.topic, s.stamps_ns[output.camera]): s for s in sets for output in outputs}
         self.missing: dict[int, list[str]] = {}
-        """After the iteration: the sets (by sequence) of which only a part arrived, with the topics that lack theirs."""
+        """After the iteration: the sets (by sequence) of which only a part arrived, and the topics of the rest."""
         self.foreign: Counter[str] = Counter()
         """After the iteration: messages by topic whose stamp belongs to no set that was sent."""
 

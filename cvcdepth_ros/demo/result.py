@@ -55,6 +55,7 @@ class DemoResult(BaseModel):
     def counts(self) -> list[tuple[str, str]]:
         """Lay out what became of sets and images, a name and a value each."""
         return [
+            ("played at times real time", f"{self.rate:.3g}"),
             ("sets sent complete", str(self.sent)),
             ("sets matched", str(self.node.matched)),
             ("sets published", str(self.node.published)),
