@@ -2,64 +2,35 @@
 """The node's parameters: one model gives their defaults, descriptions, ranges and checks."""
 
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 from pydantic.fields import FieldInfo
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
 
 from cvcdepth_core.calibration import first_validation_message
-from cvcdepth_core.checkpoint import DepthModelSpec
 from cvcdepth_core.errors import ConfigError
-from cvcdepth_core.estimator import DepthEstimator
-from cvcdepth_core.pointcloud import CloudLimits
+from cvcdepth_ros.settings import MatchingSettings, ModelSettings, OutputSettings
 
 AUTO = "auto"
 
 CHANGEABLE_WHILE_RUNNING = ("cloud_stride", "cloud_min_range", "cloud_max_range")
 
 
-class NodeParameters(BaseModel):
+class NodeParameters(OutputSettings, MatchingSettings, ModelSettings):
     """Everything that can be set; the docstring of each field is its ROS description."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     rig: str = ""
     """Rig file (YAML), or 'auto': find the cameras among the live topics and their poses on /tf_static."""
     base_frame: str = "base_link"
     """With rig 'auto': the vehicle's frame. A rig file names its own."""
-    checkpoint: str = ""
-    """Checkpoint file (safetensors) of the depth network."""
-    untrained: bool = False
-    """Run a network with random weights instead of a checkpoint. Its depth has the right form and no meaning."""
-    encoder: str = "resnet18"
-    """Untrained network only: resnet18 or resnet34. A checkpoint names its own."""
-    height: int = Field(384, ge=32, le=4096, multiple_of=32)
-    """Untrained network only: rows of its input. A checkpoint names its own."""
-    width: int = Field(640, ge=32, le=4096, multiple_of=32)
-    """Untrained network only: columns of its input. A checkpoint names its own."""
-    device: str = "auto"
-    """Where inference runs: auto (CUDA where there is one), cpu, cuda, cuda:1 ..."""
     autostart: bool = True
     """Configure and activate at start; switch off where a lifecycle manager does that."""
-    tolerance: float = Field(0.1, gt=0, le=10)
-    """Seconds that two images of one set may be apart."""
-    queue_size: int = Field(10, ge=2, le=1000)
-    """Images that are kept per camera while their set is not complete."""
     max_age: float = Field(0.5, ge=0, le=3600)
     """Seconds (ROS time) after which a waiting set is not worth inference any more; 0 takes any age."""
     reliable: bool = False
     """Subscribe images and camera_info reliably instead of with sensor-data QoS."""
-    depth_encoding: Literal["32FC1", "16UC1"] = "32FC1"
-    """Encoding of depth images: 32FC1 metres with NaN for unknown, or 16UC1 millimetres with 0 (REP 118)."""
-    cloud_stride: int = Field(2, ge=1, le=64)
-    """Merged cloud: every n-th row and column."""
-    cloud_min_range: float = Field(0.5, ge=0, le=1e4)
-    """Merged cloud: metres from a camera below which points are left out."""
-    cloud_max_range: float = Field(80.0, gt=0, le=1e4)
-    """Merged cloud: metres from a camera above which points are left out."""
 
     def check_complete(self) -> None:
         """Raise ConfigError where the parameters are each possible but together not enough to start with."""
@@ -70,23 +41,6 @@ class NodeParameters(BaseModel):
                 f"parameters checkpoint '{self.checkpoint}' and untrained {self.untrained}: name a checkpoint file, or"
                 " set untrained to run random weights, whose depth means nothing"
             )
-
-    def build_estimator(self) -> DepthEstimator:
-        """Load the checkpoint, or make the untrained network; CheckpointError or ConfigError says what is wrong."""
-        if not self.untrained:
-            return DepthEstimator.from_checkpoint(Path(self.checkpoint).expanduser(), self.device)
-        try:
-            spec = DepthModelSpec(
-                encoder=self.encoder, height=self.height, width=self.width, min_depth=1.5, max_depth=200.0
-            )
-        except ValidationError as error:
-            raise ConfigError(f"parameter {first_validation_message(error)}") from error
-        return DepthEstimator.untrained(spec, self.device)
-
-    @property
-    def cloud_limits(self) -> CloudLimits:
-        """The merged cloud's limits."""
-        return CloudLimits(self.cloud_stride, self.cloud_min_range, self.cloud_max_range)
 
 
 def declare_parameters(node: Node) -> None:

@@ -11,16 +11,16 @@ from rclpy.node import Node
 
 from cvcdepth_core.errors import CvcDepthError, TransformError
 from cvcdepth_core.estimator import DepthEstimator, SurroundDepth, SurroundDepthEstimator
-from cvcdepth_core.images import Picture
 from cvcdepth_core.rig import RigLayout
 from cvcdepth_ros.diagnostics import ERROR, OK, camera_status, latency_status, synchronisation_status
 from cvcdepth_ros.inputs import CameraInputs, ReceivedImage, StaticTransformInput
 from cvcdepth_ros.latencies import StageLatencies
 from cvcdepth_ros.mailbox import Mailbox
-from cvcdepth_ros.messages import picture_from_message, stamp_ns
+from cvcdepth_ros.messages import stamp_ns
 from cvcdepth_ros.node_parameters import NodeParameters, read_parameters
 from cvcdepth_ros.outputs import SurroundOutputs
 from cvcdepth_ros.rig_assembly import RigAssembler
+from cvcdepth_ros.set_estimation import estimate_set
 from cvcdepth_ros.synchronizer import SurroundSet, SurroundSynchronizer
 
 _WORKER_JOIN_SECONDS = 1.0
@@ -158,19 +158,10 @@ class SurroundSession:
             received = [image.received for image in surround_set.images.values()]
             self.latencies.record("wait for set", max(received) - min(received))
             self.latencies.record("wait for worker", time.monotonic() - max(received))
-            self._publish(surround_set, surround, self._estimate(surround_set, surround))
+            images = [image.message for image in surround_set.images.values()]
+            self._publish(surround_set, surround, estimate_set(images, surround, self.latencies))
             self.latencies.record("last image to published", time.monotonic() - max(received))
             self._counters["published"] += 1
-
-    def _estimate(self, surround_set: SurroundSet[ReceivedImage], surround: SurroundDepthEstimator) -> SurroundDepth:
-        with self.latencies.measure("decode"):
-            pictures: list[Picture] = [
-                picture_from_message(image.message, name) for name, image in surround_set.images.items()
-            ]
-        with self.latencies.measure("rectify"):
-            rectified = [surround.rectify(index, picture) for index, picture in enumerate(pictures)]
-        with self.latencies.measure("inference"):
-            return surround.estimate(rectified)
 
     def _publish(
         self, surround_set: SurroundSet[ReceivedImage], surround: SurroundDepthEstimator, depth: SurroundDepth

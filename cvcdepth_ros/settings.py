@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What can be set for the live node and for recordings alike: the network, the matching, the outputs. No ROS here.
+
+The node declares these fields as parameters, the bag tool as options; each field's docstring is its description there.
+"""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from cvcdepth_core.calibration import first_validation_message
+from cvcdepth_core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from cvcdepth_core.estimator import DepthEstimator
+    from cvcdepth_core.pointcloud import CloudLimits
+
+
+class Settings(BaseModel):
+    """Frozen, and nothing may be misspelt."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+
+class ModelSettings(Settings):
+    """Which network estimates depth, and where it runs."""
+
+    checkpoint: str = ""
+    """Checkpoint file (safetensors) of the depth network."""
+    untrained: bool = False
+    """Run a network with random weights instead of a checkpoint. Its depth has the right form and no meaning."""
+    encoder: str = "resnet18"
+    """Untrained network only: resnet18 or resnet34. A checkpoint names its own."""
+    height: int = Field(384, ge=32, le=4096, multiple_of=32)
+    """Untrained network only: rows of its input. A checkpoint names its own."""
+    width: int = Field(640, ge=32, le=4096, multiple_of=32)
+    """Untrained network only: columns of its input. A checkpoint names its own."""
+    device: str = "auto"
+    """Where inference runs: auto (CUDA where there is one), cpu, cuda, cuda:1 ..."""
+
+    def build_estimator(self) -> "DepthEstimator":
+        """Load the checkpoint, or make the untrained network; CheckpointError or ConfigError says what is wrong."""
+        from cvcdepth_core.checkpoint import DepthModelSpec
+        from cvcdepth_core.estimator import DepthEstimator
+
+        if not self.untrained:
+            return DepthEstimator.from_checkpoint(Path(self.checkpoint).expanduser(), self.device)
+        try:
+            spec = DepthModelSpec(
+                encoder=self.encoder, height=self.height, width=self.width, min_depth=1.5, max_depth=200.0
+            )
+        except ValidationError as error:
+            raise ConfigError(f"parameter {first_validation_message(error)}") from error
+        return DepthEstimator.untrained(spec, self.device)
+
+
+class MatchingSettings(Settings):
+    """Which images make a surround set."""
+
+    tolerance: float = Field(0.1, gt=0, le=10)
+    """Seconds that two images of one set may be apart."""
+    queue_size: int = Field(10, ge=2, le=1000)
+    """Images that are kept per camera while their set is not complete."""
+
+
+class OutputSettings(Settings):
+    """What the depth images and clouds are like."""
+
+    depth_encoding: Literal["32FC1", "16UC1"] = "32FC1"
+    """Encoding of depth images: 32FC1 metres with NaN for unknown, or 16UC1 millimetres with 0 (REP 118)."""
+    cloud_stride: int = Field(2, ge=1, le=64)
+    """Merged cloud: every n-th row and column."""
+    cloud_min_range: float = Field(0.5, ge=0, le=1e4)
+    """Merged cloud: metres from a camera below which points are left out."""
+    cloud_max_range: float = Field(80.0, gt=0, le=1e4)
+    """Merged cloud: metres from a camera above which points are left out."""
+
+    @property
+    def cloud_limits(self) -> "CloudLimits":
+        """The merged cloud's limits."""
+        from cvcdepth_core.pointcloud import CloudLimits
+
+        return CloudLimits(self.cloud_stride, self.cloud_min_range, self.cloud_max_range)
