@@ -3,37 +3,41 @@
 
 import threading
 import time
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 _WINDOW = 1000
 
 
 @dataclass(frozen=True)
 class StageSummary:
-    """Milliseconds over the last sets of one stage."""
+    """How long one stage took: milliseconds over the last sets, and seconds over all of them."""
 
     count: int
     p50_ms: float
     p95_ms: float
     max_ms: float
+    total_s: float
 
 
 class StageLatencies:
-    """Rolling windows of durations, one per stage. Thread-safe."""
+    """Rolling windows of durations, one per stage, and their sums. Thread-safe."""
 
     def __init__(self) -> None:
         self._windows: dict[str, deque[float]] = {}
+        self._totals: defaultdict[str, float] = defaultdict(float)
         self._lock = threading.Lock()
 
     def record(self, stage: str, seconds: float) -> None:
         """Add one duration."""
         with self._lock:
             self._windows.setdefault(stage, deque(maxlen=_WINDOW)).append(seconds)
+            self._totals[stage] += seconds
 
     @contextmanager
     def measure(self, stage: str) -> Iterator[None]:
@@ -45,8 +49,10 @@ class StageLatencies:
     def summaries(self) -> dict[str, StageSummary]:
         """Return the percentiles of every stage, in the order in which the stages first came."""
         with self._lock:
-            windows = {stage: np.array(window) * 1e3 for stage, window in self._windows.items()}
-        return {
-            stage: StageSummary(ms.size, float(np.percentile(ms, 50)), float(np.percentile(ms, 95)), float(ms.max()))
-            for stage, ms in windows.items()
-        }
+            windows = {stage: (np.array(window) * 1e3, self._totals[stage]) for stage, window in self._windows.items()}
+        return {stage: _summary(ms, total) for stage, (ms, total) in windows.items()}
+
+
+def _summary(ms: NDArray[np.float64], total: float) -> StageSummary:
+    p50, p95 = np.percentile(ms, [50, 95]).tolist()
+    return StageSummary(ms.size, p50, p95, float(ms.max()), total)

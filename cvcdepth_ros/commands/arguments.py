@@ -7,7 +7,14 @@ import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeVar, get_args, get_origin
+
+from pydantic import ValidationError
+
+from cvcdepth_core.calibration import first_validation_message
+from cvcdepth_ros.settings import ModelSettings
+
+SettingsT = TypeVar("SettingsT", bound=ModelSettings)
 
 
 def add_recording(parser: argparse.ArgumentParser) -> None:
@@ -28,6 +35,33 @@ def add_window(parser: argparse.ArgumentParser) -> None:
 def add_json(parser: argparse.ArgumentParser) -> None:
     """Declare `--json`."""
     parser.add_argument("--json", action="store_true", help="print the result as one JSON document")
+
+
+def add_settings(parser: argparse.ArgumentParser, settings: type[ModelSettings]) -> None:
+    """Declare an option for every field of a settings model; what is not given keeps the model's default."""
+    network = parser.add_mutually_exclusive_group(required=True)
+    for name, field in settings.model_fields.items():
+        group = network if name in ("checkpoint", "untrained") else parser
+        shown = "" if field.default in ("", False) else f" [{field.default}]"
+        group.add_argument(
+            f"--{name.replace('_', '-')}",
+            help=f"{field.description}{shown}",
+            default=argparse.SUPPRESS,
+            **_value_of(field.annotation),
+        )
+
+
+def settings_from(arguments: argparse.Namespace, settings: type[SettingsT]) -> SettingsT:
+    """Build the settings that `add_settings` declared; a value out of range ends the program as wrong use."""
+    given = {name: value for name, value in vars(arguments).items() if name in settings.model_fields}
+    untrained_only = sorted(given.keys() & {"encoder", "height", "width"})
+    if "checkpoint" in given and untrained_only:
+        arguments.usage_error(f"--{', --'.join(untrained_only)}: for --untrained only, a checkpoint names its own")
+    try:
+        return settings.model_validate(given)
+    except ValidationError as error:
+        arguments.usage_error(f"argument --{first_validation_message(error)}")
+        raise
 
 
 def window_ns(arguments: argparse.Namespace, recording_start: int) -> tuple[int, int | None]:
@@ -70,3 +104,12 @@ def non_negative(text: str) -> float:
     if not 0 <= number < math.inf:
         raise argparse.ArgumentTypeError(f"'{text}' is not a number of at least 0")
     return number
+
+
+def _value_of(annotation: Any) -> dict[str, Any]:
+    """Return argparse's way of reading a value of this type."""
+    if annotation is bool:
+        return {"action": "store_true"}
+    if get_origin(annotation) is Literal:
+        return {"choices": get_args(annotation)}
+    return {"type": annotation, "metavar": {int: "N", float: "X"}.get(annotation, "TEXT")}

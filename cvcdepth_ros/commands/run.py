@@ -1,15 +1,223 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`run`: depth."""
+"""`run`: compute depth for a whole recording and store it in another."""
 
 import argparse
+import json
+import shutil
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
-SUMMARY = """Compute"""
-EXAMPLES: tuple[str, ...] = ()
+from cvcdepth_core.errors import RecordingError
+from cvcdepth_ros.commands.arguments import (
+    add_json,
+    add_recording,
+    add_settings,
+    add_window,
+    print_result,
+    settings_from,
+    table,
+    warn,
+    window_ns,
+)
+from cvcdepth_ros.settings import MatchingSettings, ModelSettings, OutputSettings
+from cvcdepth_ros.version import package_version
+
+if TYPE_CHECKING:
+    from cvcdepth_core.rig import RigLayout
+    from cvcdepth_ros.bags import Recording
+    from cvcdepth_ros.replay import DepthReplay, EstimatedSet, SurroundReplay
+
+SUMMARY = """Compute depth and clouds into a new recording that Foxglove and RViz open.
+
+The same matching, preprocessing and network as the live node, without DDS and as fast as it goes: every set is
+computed. OUT becomes a rosbag2 folder (mcap) with depth images, camera_info, rectified pictures, the merged cloud and
+the transforms, on the node's topic names; OUT/run.json tells what was done with what."""
+EXAMPLES: tuple[str, ...] = (
+    "run drive.mcap -o depth --checkpoint model.safetensors",
+    "run drive/ -o depth --checkpoint model.safetensors --rig rig.yaml --start 10 --duration 5 --clouds all",
+    "run drive/ -o try_out --untrained --height 96 --width 160",
+)
+
+_RESULT_FILE = "run.json"
+
+
+class RunSettings(OutputSettings, MatchingSettings, ModelSettings):
+    """The settings of `run`."""
+
+    clouds: Literal["merged", "all", "none"] = "merged"
+    """Clouds to store: the merged one, each camera's organised one too, or none."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
+    add_recording(parser)
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="folder to create")
+    parser.add_argument("--rig", type=Path, metavar="FILE", help="rig file [the cameras found in the recording]")
+    parser.add_argument(
+        "--base-frame", metavar="FRAME", default="base_link", help="without --rig: the vehicle's frame [base_link]"
+    )
+    add_window(parser)
+    add_settings(parser, RunSettings)
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+    add_json(parser)
 
 
 def execute(arguments: argparse.Namespace) -> None:
-    """Declare the options."""
+    """Run to the end or to Ctrl-C; the output is whole in both cases."""
+    settings = settings_from(arguments, RunSettings)
+    from cvcdepth_ros.bags import open_recording
+    from cvcdepth_ros.replay import DepthReplay, SurroundReplay
+
+    if settings.untrained:
+        warn("untrained: the network has random weights, and its depth means nothing")
+    with open_recording(arguments.recording) as recording:
+        replay = SurroundReplay(recording, _layout(arguments, recording), settings)
+        depths = DepthReplay(replay, settings.build_estimator())
+        outcome = _record(arguments, settings, replay, depths)
+        result = {
+            "version": package_version(),
+            "recording": str(recording.path),
+            "output": str(arguments.output),
+            "model": depths.estimator.model_id,
+            "configuration": _configuration(arguments, settings, replay),
+            **outcome,
+            "damage": recording.damage,
+        }
+    (arguments.output / _RESULT_FILE).write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    print_result(result, _text(result), arguments.json)
+    if result["interrupted"]:
+        raise KeyboardInterrupt
+
+
+def _layout(arguments: argparse.Namespace, recording: "Recording") -> "RigLayout":
+    from cvcdepth_core.rig import load_rig_layout
+    from cvcdepth_ros.recorded_rig import discover_rig
+
+    return load_rig_layout(arguments.rig) if arguments.rig else discover_rig(recording, arguments.base_frame)
+
+
+def _record(
+    arguments: argparse.Namespace, settings: RunSettings, replay: "SurroundReplay", depths: "DepthReplay"
+) -> dict[str, Any]:
+    """Compute and write all sets; without any, nothing is left behind and RecordingError says why."""
+    from cvcdepth_ros.depth_recording import DepthRecorder
+
+    window = window_ns(arguments, replay.recording.start)
+    began = time.monotonic()
+    with (
+        DepthRecorder(arguments.output, replay, settings, settings.clouds, window[0]) as recorder,
+        _stoppable() as stop,
+    ):
+        sets = depths.sets(*window, recorder.handlers)
+        seconds = (min(window[1] or replay.recording.end, replay.recording.end) - window[0]) / 1e9
+        written = 0
+        for estimated in _with_progress(sets, seconds, arguments.quiet):
+            with depths.latencies.measure("write"):
+                recorder.write(estimated)
+            written += 1
+            if stop.is_set():
+                break
+    if not written and not stop.is_set():
+        shutil.rmtree(arguments.output)
+        raise RecordingError(f"{replay.recording.path}: no set: {_why_nothing(replay, depths, window)}")
+    return _outcome(replay, depths, written, time.monotonic() - began) | {"interrupted": stop.is_set()}
+
+
+def _with_progress(sets: "Iterator[EstimatedSet]", seconds: float, quiet: bool) -> "Iterator[EstimatedSet]":
+    """Show on a terminal how much of the recording is done."""
+    from tqdm import tqdm
+
+    form = "{percentage:3.0f}%|{bar}| {n:.1f} of {total:.1f} s recorded, {postfix} [{elapsed}<{remaining}]"
+    first = None
+    with tqdm(total=seconds, disable=True if quiet else None, bar_format=form, postfix="0 sets") as bar:
+        for number, estimated in enumerate(sets, 1):
+            yield estimated
+            first = first or estimated.images.stamp_ns
+            bar.set_postfix_str(f"{number} sets", refresh=False)
+            bar.update((estimated.images.stamp_ns - first) / 1e9 - bar.n)
+
+
+@contextmanager
+def _stoppable() -> "Iterator[threading.Event]":
+    """Give an event that Ctrl-C or SIGTERM sets, so that the set in hand is still written; a second one interrupts."""
+    stop = threading.Event()
+
+    def handle(*_: object) -> None:
+        if stop.is_set():
+            raise KeyboardInterrupt
+        stop.set()
+
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _why_nothing(replay: "SurroundReplay", depths: "DepthReplay", window: tuple[int, int | None]) -> str:
+    for refusals in (depths.refused, replay.unreadable):
+        if refusals.count:
+            return f"{refusals.count} refused, the first: {refusals.reasons[0]}"
+    return replay.why_no_set(*window)
+
+
+def _outcome(replay: "SurroundReplay", depths: "DepthReplay", written: int, seconds: float) -> dict[str, Any]:
+    statistics, anchor = replay.statistics, replay.layout.anchor_camera
+    stages = {stage: summary.total_s for stage, summary in depths.latencies.summaries().items()}
+    stages["read and match"] = seconds - sum(stages.values())
+    return {
+        "sets": {
+            "written": written,
+            "matched": statistics.sets,
+            "incomplete": sum(statistics.cameras[anchor].dropped.values()),
+            "refused": depths.refused.count,
+        },
+        "images": {name: asdict(camera) for name, camera in statistics.cameras.items()},
+        "refused": depths.refused.reasons + replay.unreadable.reasons,
+        "seconds": {"total": round(seconds, 3), **{stage: round(total, 3) for stage, total in stages.items()}},
+    }
+
+
+def _configuration(arguments: argparse.Namespace, settings: RunSettings, replay: "SurroundReplay") -> dict[str, Any]:
+    """Everything that the result depends on, the rig as it was completed included."""
+    layout = replay.layout
+    return {
+        **settings.model_dump(),
+        "start": arguments.start,
+        "duration": arguments.duration,
+        "rig": str(arguments.rig) if arguments.rig else None,
+        "base_frame": layout.base_frame,
+        "anchor": layout.anchor_camera,
+        "cameras": layout.model_dump(mode="json", exclude_defaults=True)["cameras"],
+    }
+
+
+def _text(result: dict[str, Any]) -> str:
+    sets, seconds = result["sets"], result["seconds"]
+    cameras = [
+        (name, str(camera["received"]), str(camera["matched"]), _reasons(camera["dropped"]))
+        for name, camera in result["images"].items()
+    ]
+    stages = ", ".join(f"{stage} {total:.1f}" for stage, total in seconds.items() if stage != "total")
+    return "\n".join(
+        [
+            table(("camera", "images", "matched", "dropped"), cameras),
+            *(f"refused: {reason}" for reason in result["refused"]),
+            *([f"not everything could be read: {result['damage']}"] if result["damage"] else []),
+            f"{sets['written']} sets written of {sets['matched']} matched; {sets['incomplete']} incomplete, "
+            f"{sets['refused']} refused",
+            f"{seconds['total']:.1f} s: {stages}",
+            f"{result['output']}, by {result['model']}",
+        ]
+    )
+
+
+def _reasons(dropped: dict[str, int]) -> str:
+    return ", ".join(f"{count} {reason}" for reason, count in dropped.items()) or "0"
