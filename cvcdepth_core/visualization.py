@@ -33,6 +33,7 @@ _VEHICLE: Colour = (245, 245, 245)
 _GRID_METRES = 10
 _VEHICLE_LENGTH, _VEHICLE_WIDTH = 4.6, 1.9  # metres; a symbol of a car's size, for the rig does not know its vehicle
 _FIELD_OF_VIEW_METRES = 4.0
+_CLOUD_GAMMA = 0.6
 _TICKS = (1, 2, 5, 10, 20, 40, 80, 160)
 
 
@@ -136,9 +137,9 @@ def top_down(rig: Rig, cloud: ColouredPoints, lidar: Points | None, view: TopDow
     """Draw the scene from above: grid, cloud in its own colours, LiDAR over it, the vehicle with its cameras."""
     picture = _filled(view.height, view.width, _PANEL)
     _draw_grid(picture, view)
-    _plot(picture, view, cloud.xyz, cloud.rgb)
+    _plot(picture, view, cloud.xyz, _brightened(cloud.rgb), size=3)
     if lidar is not None:
-        _plot(picture, view, lidar, np.broadcast_to(np.array(_LIDAR, dtype=np.uint8), lidar.shape))
+        _plot(picture, view, lidar, np.broadcast_to(np.array(_LIDAR, dtype=np.uint8), lidar.shape), size=2)
     _draw_vehicle(picture, view, rig)
     _draw_grid_labels(picture, view)
     return picture
@@ -259,14 +260,20 @@ def _field_of_view(camera: Camera) -> NDArray[np.float64]:
     return corners + camera.base_T_camera[:3, 3]
 
 
-def _plot(picture: Picture, view: TopDownView, xyz: Points, rgb: NDArray[np.uint8]) -> None:
-    """Plot points [M, 3], two pixels wide, the highest last, so that what stands up hides the ground below it."""
+def _brightened(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Lift dark colours, since roads and cars would vanish on the dark ground."""
+    lifted: NDArray[np.uint8] = np.rint(255.0 * (rgb / 255.0) ** _CLOUD_GAMMA).astype(np.uint8)
+    return lifted
+
+
+def _plot(picture: Picture, view: TopDownView, xyz: Points, rgb: NDArray[np.uint8], size: int) -> None:
+    """Plot points [M, 3] as squares of `size` pixels, the highest last, so that what stands up hides the ground."""
     finite = np.isfinite(xyz).all(axis=1)
     upwards = np.argsort(xyz[finite, 2], kind="stable")
     pixels = np.floor(view.pixels(xyz[finite][upwards])).astype(np.int64)
     colours = rgb[finite][upwards]
-    for shift in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        column, row = (pixels + shift).T
+    for shift in np.ndindex(size, size):
+        column, row = (pixels + shift - size // 2).T
         inside = (column >= 0) & (column < view.width) & (row >= 0) & (row < view.height)
         picture[row[inside], column[inside]] = colours[inside]
 

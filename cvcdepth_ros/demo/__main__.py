@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from pydantic import ValidationError
 from tqdm import tqdm
 
-from cvcdepth_core.errors import CvcDepthError
+from cvcdepth_core.calibration import first_validation_message
+from cvcdepth_core.errors import ConfigError, CvcDepthError
 from cvcdepth_core.rig import RigLayout, load_rig_layout
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.commands.arguments import positive
@@ -27,6 +29,7 @@ from cvcdepth_ros.demo.processes import children
 from cvcdepth_ros.demo.received import Output, ReceivedSets, node_outputs, sent_sets
 from cvcdepth_ros.demo.result import UNTRAINED_WARNING, DemoResult
 from cvcdepth_ros.demo.sheets import SheetWriter
+from cvcdepth_ros.settings import ModelSettings
 from cvcdepth_ros.version import package_version
 
 SAMPLE = Path(__file__).parents[2] / "samples" / "pandaset_002_excerpt"
@@ -58,14 +61,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(options: argparse.Namespace) -> DemoResult:
     """Play, record, count, draw and tell."""
+    model = _model(options)
     paths = DemoPaths(options.output)
     paths.prepare()
-    if not options.checkpoint:
+    if model.untrained:
         print(f"{UNTRAINED_WARNING}. No checkpoint was given: its weights are random.")
     with children(paths.logs) as family:
         live = LiveRun(family, paths, NODE)
         live.write_rig(options.recording)
-        setup = Setup.of(options, paths)
+        setup = Setup.of(options.recording, model, paths)
         setup.write_parameters(paths)
         rate = options.rate or setup.manageable_rate()
         print(f"playing {setup.recording.name} at {rate:.3g} times real time")
@@ -83,32 +87,30 @@ class Setup:
 
     recording: Path
     layout: RigLayout
+    model: ModelSettings
     parameters: dict[str, Any]
     """The node's."""
     outputs: list[Output]
 
     @classmethod
-    def of(cls, options: argparse.Namespace, paths: DemoPaths) -> "Setup":
+    def of(cls, recording: Path, model: ModelSettings, paths: DemoPaths) -> "Setup":
         """Set up for the rig file that was written before."""
         layout = load_rig_layout(paths.rig)
-        if options.checkpoint:
-            network: dict[str, Any] = {"checkpoint": str(options.checkpoint.absolute())}
-        else:
-            network = {"untrained": True, "height": options.height, "width": options.width}
         parameters = {
             "use_sim_time": True,
             "rig": str(paths.rig.absolute()),
             "tolerance": _TOLERANCE_SECONDS,
             # Best-effort images are lost on a busy machine, where reliable ones make the player wait.
-            "reliable": True,
-            **network,
+            "reliable": False,
+            **model.model_dump(exclude_defaults=True),
         }
-        return cls(options.recording, layout, parameters, node_outputs(NODE, layout.names, layout.anchor_camera))
+        outputs = node_outputs(NODE, layout.names, layout.anchor_camera)
+        return cls(recording, layout, model, parameters, outputs)
 
     @property
     def untrained(self) -> bool:
         """Whether the network has random weights."""
-        return "checkpoint" not in self.parameters
+        return self.model.untrained
 
     def write_parameters(self, paths: DemoPaths) -> None:
         """Write the node's parameter file."""
@@ -118,13 +120,23 @@ class Setup:
     def manageable_rate(self) -> float:
         """Measure how fast the recording may be played here."""
         with open_recording(self.recording) as recording:
-            return manageable_rate(recording, self.layout, self.parameters)
+            return manageable_rate(recording, self.layout, self.model)
 
     def notes(self, outcome: LiveOutcome) -> list[str]:
         """Return the lines below every picture."""
         is_sample = self.recording.resolve() == SAMPLE
         source = _SAMPLE_CREDIT if is_sample else f"Recording: {self.recording.name}"
         return [f"Network: {outcome.node.model or 'none ran'}. {source}"]
+
+
+def _model(options: argparse.Namespace) -> ModelSettings:
+    """Return the network that was asked for; ConfigError when it cannot be."""
+    if options.checkpoint:
+        return ModelSettings.model_validate({"checkpoint": str(options.checkpoint.absolute())})
+    try:
+        return ModelSettings.model_validate({"untrained": True, "height": options.height, "width": options.width})
+    except ValidationError as error:
+        raise ConfigError(f"--{first_validation_message(error)}") from error
 
 
 def _show(setup: Setup, paths: DemoPaths, outcome: LiveOutcome) -> DemoResult:

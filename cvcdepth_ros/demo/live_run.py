@@ -8,10 +8,10 @@ from typing import Any
 
 from tqdm import tqdm
 
-from cvcdepth_ros.demo.node_report import NodeReport
+from cvcdepth_ros.demo.node_report import DIAGNOSTICS_TOPIC, NodeReport
 from cvcdepth_ros.demo.paths import DemoPaths
 from cvcdepth_ros.demo.processes import Child, Children, DemoError, wait_until
-from cvcdepth_ros.demo.received import DIAGNOSTICS_TOPIC, Output
+from cvcdepth_ros.demo.received import Output
 
 _START_SECONDS = 120.0
 _SETTLE_SECONDS = 60.0

@@ -7,6 +7,8 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
+DIAGNOSTICS_TOPIC = "/diagnostics"
+
 _ERROR = 2  # diagnostic_msgs/DiagnosticStatus.ERROR
 _LOST = "lost in transport"
 _DROPPED = "dropped: "

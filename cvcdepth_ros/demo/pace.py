@@ -2,37 +2,33 @@
 """How fast a recording may be played so that this machine manages every set."""
 
 import time
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
+from cvcdepth_core.estimator import DepthEstimator
 from cvcdepth_core.rig import RigLayout
 from cvcdepth_ros.bags import Recording
-from cvcdepth_ros.node_parameters import NodeParameters
+from cvcdepth_ros.settings import ModelSettings
 from cvcdepth_ros.synchronizer import NANOSECONDS
 
 _MARGIN = 3.0  # the processor is shared with player, recorder, and whatever else the machine does
 _FASTEST, _SLOWEST_SECONDS = 1.0, 6.0
 
 
-def manageable_rate(recording: Recording, layout: RigLayout, parameters: Mapping[str, Any]) -> float:
+def manageable_rate(recording: Recording, layout: RigLayout, model: ModelSettings) -> float:
     """Return the rate at which the node has three times as long for a set as its inference takes.
 
-    It is measured with the node's own parameters on this machine; at most real time, at least a set in six seconds.
+    That is measured, with the node's own network on this machine; at most real time, at least a set in six seconds.
     """
-    inference = _inference_seconds(parameters, len(layout.cameras))
+    inference = _inference_seconds(model.build_estimator(), len(layout.cameras))
     anchor = next(camera.image_topic for camera in layout.cameras if camera.name == layout.anchor_camera)
     seconds = (recording.end - recording.start) / NANOSECONDS
     period = seconds / max(recording.topics[anchor].count, 1)
     return min(period / min(_MARGIN * inference, _SLOWEST_SECONDS), _FASTEST)
 
 
-def _inference_seconds(parameters: Mapping[str, Any], cameras: int) -> float:
+def _inference_seconds(estimator: DepthEstimator, cameras: int) -> float:
     """Time the estimator on one set of grey pictures; a first run, which sets things up, does not count."""
-    estimator = NodeParameters.model_validate(
-        {name: value for name, value in parameters.items() if name in NodeParameters.model_fields}
-    ).build_estimator()
     pictures = [np.full((estimator.spec.height, estimator.spec.width, 3), 127, dtype=np.uint8)] * cameras
     focal_lengths = np.full(cameras, float(estimator.spec.width))
     estimator.estimate(pictures, focal_lengths)

@@ -15,37 +15,31 @@ from cvcdepth_core.visualization import ColouredPoints
 from cvcdepth_ros.bags import Recording, open_recording
 from cvcdepth_ros.demo.clouds import coloured_points
 from cvcdepth_ros.messages import picture_from_message, stamp_ns
+from cvcdepth_ros.surround_messages import DEPTH, DEPTH_INFO, MERGED_CLOUD, PICTURE, output_types
 from cvcdepth_ros.synchronizer import SurroundSet, SurroundSynchronizer
 
 SentSet = SurroundSet[int]
 """A set as it was sent; its `images` are the log times (ns) of the recording's images."""
 
-DIAGNOSTICS_TOPIC = "/diagnostics"
-
 
 @dataclass(frozen=True)
 class Output:
-    """One topic of the node, and what the demo uses it for."""
+    """One topic of the node."""
 
     topic: str
     type_name: str
     camera: str
     """The camera whose stamp its messages carry."""
-    content: str
-    """What a message of it is to a set: depth, camera_info, picture or cloud."""
+    part: str
+    """Its name below the camera's, or below the node's for the merged cloud."""
 
 
 def node_outputs(node: str, cameras: Sequence[str], anchor: str) -> list[Output]:
-    """List what the node called `node` publishes for each set: one message of each."""
-    image, info = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
-    outputs = [Output(f"{node}/points", "sensor_msgs/msg/PointCloud2", anchor, "cloud")]
-    for camera in cameras:
-        outputs += [
-            Output(f"{node}/{camera}/depth/image_rect", image, camera, "depth"),
-            Output(f"{node}/{camera}/depth/camera_info", info, camera, "camera_info"),
-            Output(f"{node}/{camera}/image_rect", image, camera, "picture"),
-        ]
-    return outputs
+    """List what of the outputs of the node called `node` makes a set: one message of each."""
+    types = output_types(cameras)
+    parts = [(camera, part, f"{camera}/{part}") for camera in cameras for part in (DEPTH, DEPTH_INFO, PICTURE)]
+    parts.append((anchor, MERGED_CLOUD, MERGED_CLOUD))
+    return [Output(f"{node}/{topic}", types[topic], camera, part) for camera, part, topic in parts]
 
 
 def sent_sets(recording: Recording, layout: RigLayout, tolerance: float, sent: Mapping[str, int]) -> list[SentSet]:
@@ -112,12 +106,12 @@ class ReceivedSets:
 
 
 def _received_set(sent: SentSet, parts: Mapping[Output, Any]) -> ReceivedSet:
-    of = {(output.content, output.camera): message for output, message in parts.items()}
-    cloud = next(message for output, message in parts.items() if output.content == "cloud")
+    of = {(output.part, output.camera): message for output, message in parts.items()}
+    cloud = next(message for output, message in parts.items() if output.part == MERGED_CLOUD)
     return ReceivedSet(
         sent,
-        pictures=np.stack([picture_from_message(of["picture", camera], camera) for camera in sent.stamps_ns]),
-        depth=np.stack([_depth(of["depth", camera]) for camera in sent.stamps_ns]),
+        pictures=np.stack([picture_from_message(of[PICTURE, camera], camera) for camera in sent.stamps_ns]),
+        depth=np.stack([_depth(of[DEPTH, camera]) for camera in sent.stamps_ns]),
         cloud=coloured_points(cloud),
     )
 

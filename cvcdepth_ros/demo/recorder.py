@@ -8,7 +8,6 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +22,8 @@ from rclpy.subscription import Subscription
 
 from cvcdepth_core.errors import ConfigError, CvcDepthError
 from cvcdepth_ros.bags import RecordingWriter
-from cvcdepth_ros.demo.node_report import read_report
-from cvcdepth_ros.demo.received import DIAGNOSTICS_TOPIC
+from cvcdepth_ros.demo.node_report import DIAGNOSTICS_TOPIC, read_report
+from cvcdepth_ros.messages import ros_message_class
 from cvcdepth_ros.process_setup import prepare_process
 
 # Room for every message of several sets, so that a moment without the processor loses nothing.
@@ -74,13 +73,20 @@ class Recorder(Node):  # type: ignore[misc] # rclpy is not annotated
             self.lost[topic] += event.total_count_change
 
         return self.create_subscription(
-            message_class(type_name),
+            self._message_class(type_name),
             topic,
             partial(self._store, topic),
             _QOS,
             raw=True,
             event_callbacks=SubscriptionEventCallbacks(matched=matched, message_lost=message_lost),
         )
+
+    @staticmethod
+    def _message_class(type_name: str) -> Any:
+        try:
+            return ros_message_class(type_name)
+        except (ImportError, AttributeError, ValueError) as error:
+            raise ConfigError(f"message type '{type_name}' is not installed here: {error}") from error
 
     def _store(self, topic: str, cdr: bytes) -> None:
         self._writer.write(topic, time.time_ns(), cdr)
@@ -99,15 +105,6 @@ class Recorder(Node):  # type: ignore[misc] # rclpy is not annotated
         report = read_report(deserialize_message(cdr, DiagnosticArray), self._watched)
         if report is not None:
             self._tell({"ready": not self._unmatched, "node": report.model_dump(), **self.summary()})
-
-
-def message_class(type_name: str) -> Any:
-    """Import the class of `package/msg/Name`; ConfigError when it is not installed."""
-    package, _, name = type_name.partition("/msg/")
-    try:
-        return getattr(import_module(f"{package}.msg"), name)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ConfigError(f"message type '{type_name}' is not known: {error}") from error
 
 
 def record(output: Path, topics: Mapping[str, str], watched: str, idle_seconds: float) -> dict[str, Any]:

@@ -63,7 +63,7 @@ class SheetWriter:
 
     def _sweep(self, surround: ReceivedSet) -> tuple[Points | None, str]:
         """Return the LiDAR's points at the set's stamp, and what the caption says of them."""
-        seen = "Right: the scene from above, grid 10 m; the merged cloud in its own colours"
+        seen = "Right: the scene from above, grid 10 m; the merged cloud in its own colours, brightened"
         try:
             points = self._lidar.nearest(surround.sent.stamp_ns, surround.sent.images[self._rig.anchor])
         except TransformError as error:
