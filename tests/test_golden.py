@@ -19,13 +19,15 @@ from torch import Tensor, nn
 from cvcdepth_core import objective
 from cvcdepth_core.augmentation import apply_changes, mirror, mirror_motion
 from cvcdepth_core.geometry import back_project, rigid_inverse, transform
+from cvcdepth_core.ground_truth import SparseDepth, downsample_ground_truth, sample_prediction
 from cvcdepth_core.losses import auto_mask, masked_mean, smoothness
-from cvcdepth_core.metrics import DepthEvaluation, downsample_ground_truth, fuse_flipped
+from cvcdepth_core.metrics import METRIC_NAMES, fuse_flipped
 from cvcdepth_core.networks import DepthNet, PoseNet, disparity_to_depth
 from cvcdepth_core.objective import ObjectiveConfig, Prediction, evaluate_objective, masked_errors, synthesise_views
 from cvcdepth_core.photometric import photometric_error, ssim_distance
 from cvcdepth_core.pose_distribution import distribute_anchor_motion, motion_to_context, relative_poses
 from cvcdepth_core.rig_batch import RigBatch
+from cvcdepth_core.scores import ALL, DepthSamples, Score, ScoreSettings, SurroundScorer
 from cvcdepth_core.view_synthesis import align_intensity, overlap_statistics, sample, warp_views
 
 CAMERAS = ["front", "front_left", "front_right", "back_left", "back_right", "back"]
@@ -495,14 +497,28 @@ def test_f_motions_and_depth_of_a_flipped_step(golden_dir):
 @pytest.mark.parametrize("dataset", ["ddad", "nuscenes"])
 def test_g_metrics_per_image_and_pooled(golden_dir, dataset, dtype, name, tolerance):
     golden = Golden(golden_dir / "g_metrics.npz")
-    for median, pool in ((False, 1), (True, 1), (False, 4), (True, 4)):
-        evaluation = DepthEvaluation(RANGES[dataset][1], scale_by_median=median, pool=pool)
-        for images in zip(golden.tensor("in_pred_depth", dtype), golden.tensor("in_gt_depth", dtype), strict=True):
-            evaluation.add(*images)
-        kind = ("median" if median else "metric") + ("_perframe_mean" if pool == 1 else "")
-        assert_equal_each(evaluation.mean(), golden[f"out_{kind}_{dataset}_{name}"], tolerance)
-        if kind == "metric":
-            assert_equal_each(evaluation.per_camera(), golden[f"out_metric_percam_{dataset}_{name}"], tolerance)
+    scorer = SurroundScorer("golden", CAMERAS, ScoreSettings(max_depth=RANGES[dataset][1]))
+    sets = zip(golden.tensor("in_pred_depth", dtype), golden.tensor("in_gt_depth", dtype), strict=True)
+    for index, images in enumerate(sets):
+        scorer.add(index, [depth_samples(p, t) for p, t in zip(*(i[:, 0].numpy() for i in images), strict=True)])
+    scores = scorer.scores()
+    for scaling in ("metric", "median"):
+        per_image, pooled = (scores.summary(protocol, scaling) for protocol in ("image", "pool"))
+        expected = golden[f"out_{scaling}_perframe_mean_{dataset}_{name}"]
+        assert_equal_each(metric_row(per_image.mean[ALL]), expected, tolerance)
+        assert_equal_each(metric_row(pooled.mean[ALL]), golden[f"out_{scaling}_{dataset}_{name}"], tolerance)
+        if scaling == "metric":
+            per_camera = torch.stack([metric_row(score[ALL]) for score in pooled.cameras.values()])
+            assert_equal_each(per_camera, golden[f"out_metric_percam_{dataset}_{name}"], tolerance)
+
+
+def depth_samples(prediction: NDArray[np.floating], truth_image: NDArray[np.floating]) -> DepthSamples:
+    truth = SparseDepth.from_image(truth_image)
+    return DepthSamples(sample_prediction(prediction, truth), truth.depth, np.zeros(len(truth), dtype=bool))
+
+
+def metric_row(score: Score) -> Tensor:
+    return torch.tensor([score.metrics[name] for name in METRIC_NAMES], dtype=torch.float64)
 
 
 def test_g_flip_fusion(golden_dir):
