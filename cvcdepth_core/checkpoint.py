@@ -21,6 +21,7 @@ from torch import Tensor, nn
 
 from cvcdepth_core.errors import CheckpointError
 from cvcdepth_core.networks import DEPTH_ENCODERS, INPUT_STRIDE, DepthNet
+from cvcdepth_core.networks.depth import MIN_INPUT_SIZE
 from cvcdepth_core.networks.resnet import ResNetEncoder
 
 FORMAT_VERSION = "1"
@@ -39,9 +40,9 @@ class DepthModelSpec(BaseModel):
 
     encoder: str = "resnet18"
     """One of `DEPTH_ENCODERS`."""
-    height: int = Field(gt=0, multiple_of=INPUT_STRIDE)
+    height: int = Field(ge=MIN_INPUT_SIZE, multiple_of=INPUT_STRIDE)
     """Rows of the network input, pixels."""
-    width: int = Field(gt=0, multiple_of=INPUT_STRIDE)
+    width: int = Field(ge=MIN_INPUT_SIZE, multiple_of=INPUT_STRIDE)
     """Columns of the network input, pixels."""
     min_depth: float = Field(gt=0, allow_inf_nan=False)
     """Metres at disparity 1 for a camera with fx = focal_scale."""
@@ -217,17 +218,19 @@ def _flush_directory(directory: Path) -> None:
 
 
 def _read_safetensors(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
-    with path.open("rb") as file:
-        if file.read(2) in (b"PK", b"\x80\x02"):
-            raise CheckpointError(
-                f"{path}: is a pickle (written by torch.save), expected a safetensors checkpoint; "
-                "the released weights are converted with import_released"
-            )
     try:
         with safe_open(path, framework="pt") as file:
             return dict(file.metadata() or {}), {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
     except SafetensorError as error:
-        raise CheckpointError(f"{path}: is damaged or not a safetensors file: {error}") from error
+        raise CheckpointError(f"{path}: {_why_unreadable(path)}: {error}") from error
+
+
+def _why_unreadable(path: Path) -> str:
+    with path.open("rb") as file:
+        beginning = file.read(2)
+    if beginning == b"PK" or beginning[:1] == pickle.PROTO:
+        return "is a pickle (torch.save), expected safetensors; import_released converts the released weights"
+    return "is damaged or not a safetensors file"
 
 
 def _read_tensors_of_pickle(path: Path) -> dict[str, Tensor]:

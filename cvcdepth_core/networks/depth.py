@@ -18,6 +18,9 @@ DEPTH_ENCODERS: tuple[str, ...] = tuple(RESNET_BLOCKS)
 INPUT_STRIDE = 32
 """Height and width of the network input must be multiples of this."""
 
+MIN_INPUT_SIZE = 64
+"""Least height and width: the mirrored border needs two pixels of the coarsest feature map."""
+
 _DECODER_CHANNELS = (16, 32, 64, 128, 256)
 
 
@@ -34,12 +37,13 @@ class DepthNet(nn.Module):
     def forward(self, images: Tensor) -> Tensor:
         """Return the disparity [B, 1, H, W] in (0, 1) of `images` [B, 3, H, W] in [0, 1].
 
-        Raises ImageError when H or W is not a multiple of 32.
+        Raises ImageError when H or W is not a multiple of 32 or below 64.
         """
         height, width = images.shape[-2:]
-        if height % INPUT_STRIDE or width % INPUT_STRIDE:
+        if height % INPUT_STRIDE or width % INPUT_STRIDE or min(height, width) < MIN_INPUT_SIZE:
             raise ImageError(
-                f"depth network: input is {width}x{height} (width x height), both must be multiples of {INPUT_STRIDE}"
+                f"depth network: input is {width}x{height} (width x height), both must be multiples of {INPUT_STRIDE} "
+                f"and at least {MIN_INPUT_SIZE}"
             )
         disparity: Tensor = self.depth_decoder(self.depth_encoder(images))
         return disparity
