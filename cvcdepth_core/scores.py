@@ -201,7 +201,7 @@ class SurroundScorer:
     """Measures the sets of one recording, in order."""
 
     def __init__(self, recording: str, cameras: Sequence[str], settings: ScoreSettings) -> None:
-        """`recording` is a name that no other recording of the evaluation has."""
+        """Name the `recording` as no other recording of the evaluation is named."""
         self._recording = recording
         self._cameras = tuple(cameras)
         self._settings = settings

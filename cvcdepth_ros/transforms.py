@@ -4,7 +4,7 @@
 Messages are taken by their attributes, so rclpy's objects and those of a recording both fit.
 """
 
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -139,6 +139,11 @@ class PoseTrack:
         before = self._stamps[index - 1]
         fraction = (stamp - before) / (self._stamps[index] - before)
         return _interpolated(self._poses[index - 1], self._poses[index], fraction)
+
+    def forget_before(self, stamp: int) -> None:
+        """Drop the poses that no lookup at or after `stamp` (ns) needs."""
+        needed = max(bisect_right(self._stamps, stamp) - 1, 0)
+        del self._stamps[:needed], self._poses[:needed]
 
 
 def _links(message: Any) -> Iterator[tuple[int, str, str, Pose]]:
