@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recording's surround sets and their depth, through the node's own matching, preprocessing and estimator.
 
-No ROS here. `SurroundReplay` gives the sets (for training, say), `DepthReplay` adds the depth. Every set is given: there is no clock
-to keep up with, hence no mailbox.
+No ROS here. `SurroundReplay` gives the sets (for training, say), `DepthReplay` adds the depth. Every set is given:
+there is no clock to keep up with, hence no mailbox.
 """
 
 import math

@@ -133,7 +133,7 @@ def _with_progress(sets: "Iterator[EstimatedSet]", seconds: float, quiet: bool) 
     """Show on a terminal how much of the recording is done."""
     from tqdm import tqdm
 
-    form = "{percentage:3.0f}%|{bar}| {n:.1f} of {total:.1f} s recorded, {postfix} [{elapsed}<{remaining}]"
+    form = "{percentage:3.0f}%|{bar}| {n:.1f} of {total:.1f} s recorded{postfix} [{elapsed}<{remaining}]"
     first = None
     with tqdm(total=seconds, disable=True if quiet else None, bar_format=form, postfix="0 sets") as bar:
         for number, estimated in enumerate(sets, 1):
