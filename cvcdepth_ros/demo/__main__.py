@@ -100,8 +100,6 @@ class Setup:
             "use_sim_time": True,
             "rig": str(paths.rig.absolute()),
             "tolerance": _TOLERANCE_SECONDS,
-            # Best-effort images are lost on a busy machine, where reliable ones make the player wait.
-            "reliable": False,
             **model.model_dump(exclude_defaults=True),
         }
         outputs = node_outputs(NODE, layout.names, layout.anchor_camera)
