@@ -127,6 +127,7 @@ def _sent(picture: NDArray[np.uint8], calibration: Calibration) -> NDArray[np.ui
 
 
 TURN, _ = cv2.Rodrigues(np.array([0.02, 0.04, -0.03]))
+LARGE_TURN, _ = cv2.Rodrigues(np.array([0.1, 0.2, -0.1]))
 SETTINGS: dict[str, tuple[dict[str, object], tuple[int, int]]] = {
     "full size": ({}, (600, 960)),
     "a ratio that is not whole": ({}, (352, 640)),
@@ -314,15 +315,16 @@ def test_one_resampling_is_as_good_as_rectifying_at_full_size_first(
 @pytest.mark.parametrize("model", MODELS)
 def test_visible_is_false_exactly_outside_the_raw_picture(model: str):
     zoomed_out = (260.0, 0, 480.0, 0, 0, 260.0, 300.0, 0, 0, 0, 1, 0)
-    calibration = _calibration(model, p=zoomed_out)
+    calibration = _calibration(model, p=zoomed_out, r=tuple(LARGE_TURN.ravel().tolist()))
     rectifier = Rectifier(calibration, 300, 480)
     u, v = np.meshgrid(np.arange(480), np.arange(300))
-    rays = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], axis=1) @ np.linalg.inv(rectifier.intrinsics).T
+    rectified_rays = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], axis=1) @ np.linalg.inv(rectifier.intrinsics).T
+    rays = rectified_rays @ calibration.rotation  # the transpose's, from the rectified camera to the raw one
     x, y = _project(calibration, rays).T
     margin = np.minimum.reduce([x + 0.5, WIDTH - 0.5 - x, y + 0.5, HEIGHT - 0.5 - y]).reshape(300, 480)
     # A network pixel covers about two raw ones and is visible when all of it is.
     reach = 2.0 * 560 / 260
-    unfolded = np.hypot(*rays[:, :2].T).reshape(300, 480) < _folding_radius(calibration)
+    unfolded = (np.hypot(*rays[:, :2].T) / rays[:, 2]).reshape(300, 480) < _folding_radius(calibration)
     assert rectifier.visible[(margin > reach) & unfolded].all()
     assert not rectifier.visible[(margin < -0.1) | ~unfolded].any()
     assert 0.2 < rectifier.visible.mean() < 0.95 or model == "equidistant"
