@@ -42,8 +42,31 @@ class AugmentationConfig(_Section):
     """Hflip-S: which networks see half of the samples mirrored."""
 
 
+class RecordingsConfig(_Section):
+    """Which moments of recordings become training samples, and how they are read."""
+
+    held_out: float = Field(default=0.25, ge=0, lt=1)
+    """The last share of every recording, by time, that is never trained on."""
+    min_travel: float = Field(default=0.1, ge=0, allow_inf_nan=False)
+    """Metres between a sample's target and each of its context frames, at least; nearer sets are passed over."""
+    min_image_change: float = Field(default=2.0, ge=0, allow_inf_nan=False)
+    """Instead of `min_travel` where no motion is recorded: mean absolute difference of the anchor camera's small grey
+    pictures, of 255."""
+    max_interval: float = Field(default=0.5, gt=0, allow_inf_nan=False)
+    """Seconds from a target to a context frame, at most: a longer gap of the recording is not bridged."""
+    exposure_motion: bool = True
+    """Place each camera where it was when it fired, by the recorded motion. The published method takes the exposures of
+    one set as simultaneous."""
+    tolerance: float = Field(default=0.1, gt=0, le=10)
+    """Seconds that two images of one set may be apart."""
+    workers: int = Field(default=0, ge=0)
+    """Processes that read and decode; 0 does it in the training process."""
+    cache_mb: int = Field(default=512, ge=0)
+    """Rectified pictures that each process keeps in memory, MB; 0 decodes every picture anew."""
+
+
 class OptimizerConfig(_Section):
-    """Adam and its schedule."""
+    """Adam, its schedule, and what keeps a step from doing harm."""
 
     learning_rate: float = Field(default=1e-4, gt=0)
     """At the start."""
@@ -55,8 +78,27 @@ class OptimizerConfig(_Section):
     """The learning rate is multiplied by `decay_factor` after every so many epochs."""
     decay_factor: float = Field(default=0.1, gt=0, le=1)
     """See `decay_after_epochs`."""
+    weight_decay: float = Field(default=0.0, ge=0)
+    """Decoupled (AdamW); 0 is the published Adam."""
     samples_per_step: int = Field(default=4, ge=1)
     """Samples, of all cameras each, whose gradients make one step: processes x samples per process x accumulation."""
+    samples_per_batch: int = Field(default=1, ge=1)
+    """Samples that go through the networks together; a divisor of `samples_per_step`."""
+    max_gradient_norm: float | None = Field(default=None, gt=0)
+    """Longer gradients are shortened to this."""
+    average_decay: float | None = Field(default=None, gt=0, lt=1)
+    """Decay of the weights' exponential moving average per step; with it, the average is what is validated and saved."""
+    autocast: Literal["none", "bfloat16"] = "none"
+    """Precision of the networks; views and losses stay in float32."""
+
+    @model_validator(mode="after")
+    def _batches_make_steps(self) -> OptimizerConfig:
+        if self.samples_per_step % self.samples_per_batch:
+            raise ValueError(
+                f"samples_per_step is {self.samples_per_step}, expected a multiple of samples_per_batch "
+                f"({self.samples_per_batch})"
+            )
+        return self
 
 
 class EvaluationConfig(_Section):
@@ -81,10 +123,16 @@ class TrainingConfig(_Section):
     """Weights and variants of the loss."""
     augmentation: AugmentationConfig = AugmentationConfig()
     """What the networks see differently from the losses."""
+    recordings: RecordingsConfig = RecordingsConfig()
+    """For `dataset: recording`: which moments become samples."""
     optimizer: OptimizerConfig = OptimizerConfig()
-    """Adam and its schedule."""
+    """Adam, its schedule, and what keeps a step from doing harm."""
     evaluation: EvaluationConfig = EvaluationConfig()
     """How predictions are scored."""
+    validate_every: int = Field(default=1, ge=1)
+    """Epochs between two validations; the last epoch is always validated."""
+    checkpoint_every: int = Field(default=200, ge=1)
+    """Steps between two checkpoints; there is one at the end of every epoch too."""
     seed: int = Field(default=42, ge=0)
     """Of every random draw; process r uses seed + r."""
 
