@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
 import platform
 import resource
 import statistics
@@ -74,6 +75,7 @@ def measure(options: argparse.Namespace, batch: RigBatch) -> dict[str, object]:
         "torch": torch.__version__,
         "python": platform.python_version(),
         "cpu_threads": torch.get_num_threads(),
+        "load_average": round(os.getloadavg()[0], 1),
         "step_ms": round(step, 1),
         "networks_ms": round(networks, 1),
         "objective_ms": round(objective, 1),

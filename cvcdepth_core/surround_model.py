@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -17,6 +17,15 @@ from cvcdepth_core.rig_batch import RigBatch
 PoseMethod = Literal["front", "joint_front", "joint", "per_camera"]
 
 _VEHICLE_LATERAL_AXIS = 1
+
+
+class MotionVector(NamedTuple):
+    """The pose network's answer."""
+
+    axis_angle: Tensor
+    """[..., 3] rad."""
+    translation: Tensor
+    """[..., 3] metres."""
 
 
 class SurroundModel(nn.Module):
@@ -48,40 +57,45 @@ class SurroundModel(nn.Module):
 
         `network_frames` [B, 3, N, 3, H, W] are the batch's frames (0, -1, +1) as the networks shall see them, jittered
         in training. The samples named by `depth_flips` and `pose_flips` (bool [B]) are shown mirrored to that network
-        and the answer is mirrored back (Hflip-S).
+        and the answer is mirrored back (Hflip-S). Under autocast only the networks run in half precision.
         """
         disparity = self._disparity(network_frames[:, 0], depth_flips)
-        depth = disparity_to_depth(
-            disparity, batch.intrinsics[..., 0, 0], self.min_depth, self.max_depth, self.focal_scale
-        )
-        return Prediction(disparity, depth, self._motions(batch, mirror(network_frames, pose_flips), pose_flips))
+        vectors = self._motion_vectors(batch, mirror(network_frames, pose_flips))
+        with torch.autocast(network_frames.device.type, enabled=False):
+            depth = disparity_to_depth(
+                disparity, batch.intrinsics[..., 0, 0], self.min_depth, self.max_depth, self.focal_scale
+            )
+            return Prediction(disparity, depth, self._motions(batch, vectors, pose_flips))
 
     def _disparity(self, images: Tensor, flips: Tensor) -> Tensor:
         samples, cameras = images.shape[:2]
         disparity: Tensor = self.depth_net(mirror(images, flips).flatten(0, 1)).to(images.dtype)
         return mirror(disparity.view(samples, cameras, *disparity.shape[1:]), flips)
 
-    def _motions(self, batch: RigBatch, frames: Tensor, flips: Tensor) -> Tensor:
-        """Return the motions [B, 2, N, 4, 4] of all cameras to the frames -1 and +1."""
-        target, before, after = frames.unbind(1)
-        lateral = _VEHICLE_LATERAL_AXIS if self.pose_method == "joint" else 0
-        raw = [
-            self._motion(batch, before, target, backward=True),
-            self._motion(batch, target, after, backward=False),
+    def _motion_vectors(self, batch: RigBatch, frames: Tensor) -> list[MotionVector]:
+        """Return what the pose network says for the frames -1 and +1: per sample [B, 3], or per camera [B*N, 3]."""
+        target, before, after = self._pose_views(batch, frames).unbind(1)
+        return [
+            MotionVector(*(part.to(frames.dtype) for part in self.pose_net(earlier, later)))
+            for earlier, later in ((before, target), (target, after))
         ]
-        motions = mirror_motion(torch.stack(raw, dim=1), flips, lateral)
+
+    def _pose_views(self, batch: RigBatch, frames: Tensor) -> Tensor:
+        """Choose from `frames` [B, 3, N, 3, H, W] the views that share a motion: [B, 3, V, ...] or [B*N, 3, 1, ...]."""
+        if self.pose_method == "front":
+            return frames[:, :, batch.anchor, None]
+        if self.pose_method == "per_camera":
+            return frames.transpose(1, 2).flatten(0, 1).unsqueeze(2)
+        return frames
+
+    def _motions(self, batch: RigBatch, vectors: list[MotionVector], flips: Tensor) -> Tensor:
+        """Return the motions [B, 2, N, 4, 4] of all cameras to the frames -1 and +1."""
+        before, after = vectors
+        raw = [motion_to_context(*before, backward=True), motion_to_context(*after, backward=False)]
+        motions = torch.stack([motion.view(len(flips), -1, 4, 4) for motion in raw], dim=1)
+        motions = mirror_motion(motions, flips, _VEHICLE_LATERAL_AXIS if self.pose_method == "joint" else 0)
         if self.pose_method == "per_camera":
             return motions
         if self.pose_method == "joint":
-            return distribute_vehicle_motion(motions, batch.base_T_camera)
-        return distribute_anchor_motion(motions, batch.base_T_camera, batch.anchor)
-
-    def _motion(self, batch: RigBatch, earlier: Tensor, later: Tensor, backward: bool) -> Tensor:
-        """Return one motion per sample [B, 4, 4], or one per camera [B, N, 4, 4], from frames [B, N, 3, H, W]."""
-        if self.pose_method == "per_camera":
-            earlier, later = earlier.flatten(0, 1).unsqueeze(1), later.flatten(0, 1).unsqueeze(1)
-        elif self.pose_method == "front":
-            earlier, later = earlier[:, batch.anchor, None], later[:, batch.anchor, None]
-        axis_angle, translation = self.pose_net(earlier, later)
-        motion = motion_to_context(axis_angle.to(earlier.dtype), translation.to(earlier.dtype), backward)
-        return motion.view(len(batch.base_T_camera), -1, 4, 4) if self.pose_method == "per_camera" else motion
+            return distribute_vehicle_motion(motions.squeeze(2), batch.base_T_camera)
+        return distribute_anchor_motion(motions.squeeze(2), batch.base_T_camera, batch.anchor)

@@ -92,6 +92,30 @@ def test_the_order_of_the_cameras_does_not_matter():
         torch.testing.assert_close(term[:, order], other.terms[name], rtol=1e-10, atol=1e-14)
 
 
+def test_where_two_neighbours_see_a_pixel_the_correction_averages_and_the_release_adds():
+    scene = slanted_plane()
+    batch = RigBatch(  # the right camera twice: the left one sees the same pixels in both
+        frames=scene.batch.frames[:, :, [0, 1, 1]],
+        masks=torch.ones(1, 3, 1, 48, 64, dtype=torch.float64),
+        intrinsics=scene.batch.intrinsics[:, [0, 1, 1]],
+        base_T_camera=scene.batch.base_T_camera[:, [0, 1, 1]],
+        targets=torch.tensor([0, 0, 1, 2]),
+        sources=torch.tensor([1, 2, 0, 0]),
+        camera_names=["left", "right", "right again"],
+    )
+    depth, motions = scene.depth[:, [0, 1, 1]], scene.motions[:, :, [0, 1, 1]]
+    added, averaged = (
+        synthesise_views(batch, Prediction(1 / depth, depth, motions), ObjectiveConfig(corrected=corrected)).overlap
+        for corrected in (False, True)
+    )
+    seen = averaged.masks[0, 0, 0] > 0
+    assert averaged.masks.max() == 1
+    assert added.masks.max() == 2
+    torch.testing.assert_close(added.depth[0, 0][seen], 2 * averaged.depth[0, 0][seen])
+    assert float((averaged.images[0, 0, 0] - batch.images[0, 0])[:, seen[0]].abs().mean()) < 0.01
+    torch.testing.assert_close(averaged.depth[0, 0][seen], depth[0, 0][seen], rtol=1e-3, atol=0)
+
+
 def test_an_empty_mask_gives_zero_and_finite_gradients():
     batch = random_batch(samples=1, cameras=3, height=16, width=24)
     batch.masks.zero_()
@@ -264,6 +288,20 @@ def test_mirrored_samples_come_back_in_place_and_leave_the_others_alone():
     torch.testing.assert_close(some.disparity[0], plain.disparity[0])
     assert not torch.allclose(some.disparity[1], plain.disparity[1], atol=1e-6)
     torch.testing.assert_close(some.motions, plain.motions)
+
+
+def test_half_precision_stays_within_the_networks():
+    batch = random_batch(samples=1, cameras=3, height=64, width=64).to(dtype=torch.float32)
+    model = SurroundModel(DepthNet(), PoseNet(), min_depth=1.5, max_depth=80)
+    flips = torch.tensor([True])
+    with torch.autocast("cpu", torch.bfloat16):
+        prediction = model(batch, batch.frames, flips, flips)
+        value = evaluate_objective(batch, prediction, ALL_TERMS)
+    assert {tensor.dtype for tensor in (prediction.depth, prediction.motions, value.loss)} == {torch.float32}
+    rotation = prediction.motions[..., :3, :3]
+    torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3).expand_as(rotation))
+    value.loss.backward()
+    assert all(parameter.grad.isfinite().all() for parameter in model.parameters())
 
 
 # --- bad input
