@@ -102,7 +102,7 @@ def save_checkpoint(
         raise CheckpointError(f"{path}: metadata keys {sorted(reserved)} are reserved")
     header |= {_VERSION_KEY: FORMAT_VERSION, _SPEC_KEY: spec.model_dump_json()}
     tensors = _prefixed(_DEPTH_PREFIX, depth_net_state) | _prefixed(_POSE_PREFIX, pose_net_state or {})
-    _write_atomically(Path(path), save(tensors, header))
+    write_atomically(Path(path), save(tensors, header))
 
 
 def load_checkpoint(path: str | Path) -> Checkpoint:
@@ -197,7 +197,8 @@ def _without_prefix(prefix: str, tensors: State) -> dict[str, Tensor]:
     }
 
 
-def _write_atomically(path: Path, content: bytes) -> None:
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write a file that appears complete or not at all, also when the power fails; raises CheckpointError."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         with temporary.open("wb") as file:

@@ -22,6 +22,10 @@ class CheckpointError(CvcDepthError):
     """A checkpoint is missing, damaged, or does not fit the network."""
 
 
+class TrainingError(CvcDepthError):
+    """A training cannot go on."""
+
+
 class RecordingError(CvcDepthError):
     """A recording cannot be read, or lacks what the command needs."""
 

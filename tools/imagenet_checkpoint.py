@@ -32,7 +32,7 @@ def main() -> None:
         )
     torch.manual_seed(config.seed)
     depth_net, pose_net = DepthNet(config.depth.encoder), PoseNet(config.pose.encoder)
-    for encoder in (depth_net.depth_encoder, pose_net.pose.encoder):
+    for encoder in (depth_net.depth_encoder, pose_net.pose_encoder):
         load_imagenet_encoder(encoder, options.classifier)
     save_checkpoint(
         options.output,
