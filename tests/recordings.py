@@ -116,6 +116,17 @@ def _raw_image(entry: Entry, encoding: str) -> Entry:
     return entry._replace(topic=topic, type=type_, cdr=bytes(JAZZY.serialize_cdr(image, type_)))
 
 
+def changed(entries: Iterable[Entry], topic: str, change: Callable[[Any], None]) -> Iterator[Entry]:
+    """The same recording after `change` was applied to every message of one topic; arrays are to be replaced."""
+    for entry in entries:
+        if entry.topic != topic:
+            yield entry
+            continue
+        message = JAZZY.deserialize_cdr(entry.cdr, entry.type)
+        change(message)
+        yield entry._replace(cdr=bytes(JAZZY.serialize_cdr(message, entry.type)))
+
+
 def _bayer_rggb(bgr: Any) -> Any:
     mosaic = np.empty(bgr.shape[:2], np.uint8)
     mosaic[0::2, 0::2] = bgr[0::2, 0::2, 2]

@@ -111,8 +111,8 @@ def _record(
     window = window_ns(arguments, replay.recording.start)
     began = time.monotonic()
     with (
-        DepthRecorder(arguments.output, replay, settings, settings.clouds, window[0]) as recorder,
         _stoppable() as stop,
+        DepthRecorder(arguments.output, replay, settings, settings.clouds, window[0]) as recorder,
     ):
         sets = depths.sets(*window, recorder.handlers)
         seconds = (min(window[1] or replay.recording.end, replay.recording.end) - window[0]) / 1e9
