@@ -4,6 +4,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -27,6 +28,33 @@ class SurroundDepth:
     """[N, H, W, 3] RGB, rectified: pixel by pixel what `depth` describes."""
     intrinsics: NDArray[np.float64]
     """[N, 3, 3] of those pictures, pixel centres at the integers."""
+
+
+class PictureSize(Protocol):
+    """The size of the pictures that a predictor takes."""
+
+    @property
+    def height(self) -> int:
+        """Rows."""
+
+    @property
+    def width(self) -> int:
+        """Columns."""
+
+
+class DepthPredictor(Protocol):
+    """Whatever gives depth for pictures: the network, or a reference that it must beat."""
+
+    @property
+    def spec(self) -> PictureSize:
+        """The pictures it takes."""
+
+    @property
+    def model_id(self) -> str:
+        """What reports call it."""
+
+    def estimate(self, pictures: Sequence[Picture], fx: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Return depth [N, H, W] in metres of RGB pictures [H, W, 3]; `fx` [N] is in pixels of those pictures."""
 
 
 class DepthEstimator:
@@ -70,12 +98,12 @@ class DepthEstimator:
 
 
 class SurroundDepthEstimator:
-    """A depth estimator for one rig: rectifies each camera's picture and estimates depth for a whole set.
+    """A depth predictor for one rig: rectifies each camera's picture and estimates depth for a whole set.
 
     `preprocessor` holds what belongs to the rig: intrinsics and validity of the network's pictures.
     """
 
-    def __init__(self, rig: Rig, estimator: DepthEstimator) -> None:
+    def __init__(self, rig: Rig, estimator: DepthPredictor) -> None:
         self.rig = rig
         self.estimator = estimator
         self.preprocessor = SurroundPreprocessor(rig, estimator.spec.height, estimator.spec.width)

@@ -11,7 +11,8 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Protocol as TypingProtocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,34 @@ Scaling = Literal["metric", "median"]
 SCALINGS: tuple[Scaling, ...] = ("metric", "median")
 
 ALL, OVERLAP = "all", "overlap"
+
+
+class Row(TypingProtocol):
+    """One line of results."""
+
+    @property
+    def key(self) -> tuple[Any, ...]:
+        """The recording's name, the set's stamp, and what tells the row from the others of that set."""
+
+
+RowType = TypeVar("RowType", bound=Row)
+
+
+def sorted_rows(rows: Iterable[RowType]) -> tuple[RowType, ...]:
+    """Sort by recording and time; the rows of a set, which always come together, keep the rig's order.
+
+    Raises ConfigError for a row that is there twice.
+    """
+    ordered = tuple(sorted(rows, key=lambda row: row.key[:2]))
+    twice = [key for key, count in Counter(row.key for row in ordered).items() if count > 1]
+    if twice:
+        raise ConfigError(f"scores: {', '.join(map(str, twice[0]))} was measured twice")
+    return ordered
+
+
+def mean(values: Sequence[float]) -> float:
+    """Return the mean, rounded once whatever the order; NaN for no values."""
+    return math.fsum(values) / len(values) if values else math.nan
 
 
 class ScoreSettings(BaseModel):
@@ -87,6 +116,11 @@ class Measurement:
     """median(truth) / median(prediction), NaN where nothing was predicted."""
     sums: Mapping[Scaling, Mapping[str, ErrorSums]]
     """By scaling and group; a group without truth is absent."""
+
+    @property
+    def key(self) -> tuple[str, int, str]:
+        """What tells it from all other measurements."""
+        return self.recording, self.stamp_ns, self.camera
 
     def to_json(self) -> dict[str, Any]:
         """Return it with JSON's types; sums are lists in the order of `ErrorSums`."""
@@ -160,8 +194,8 @@ class Scores:
                 raise ConfigError(f"scores: settings {other.settings} and {settings} cannot be merged")
         return cls(
             settings,
-            _sorted_rows(row for part in parts for row in part.images),
-            _sorted_rows(row for part in parts for row in part.pools),
+            sorted_rows(row for part in parts for row in part.images),
+            sorted_rows(row for part in parts for row in part.pools),
         )
 
     @property
@@ -226,7 +260,7 @@ class SurroundScorer:
 
     def scores(self) -> Scores:
         """Return what was measured so far."""
-        return Scores(self._settings, _sorted_rows(self._images), _sorted_rows(self._pools))
+        return Scores(self._settings, sorted_rows(self._images), sorted_rows(self._pools))
 
     def _close_pool(self) -> None:
         stamps, sets = zip(*self._pooled_sets, strict=True)
@@ -268,16 +302,6 @@ def _sums_by_group(image: DepthSamples, settings: ScoreSettings) -> dict[str, Er
     return {g: sum_errors(image.prediction[mask], image.truth[mask]) for g, mask in masks.items() if mask.any()}
 
 
-def _sorted_rows(rows: Iterable[Measurement]) -> tuple[Measurement, ...]:
-    """Sort by recording and time; the cameras of a set, which always come together, keep the rig's order."""
-    ordered = tuple(sorted(rows, key=lambda row: (row.recording, row.stamp_ns)))
-    counts = Counter((row.recording, row.stamp_ns, row.camera) for row in ordered)
-    twice = next((key for key, count in counts.items() if count > 1), None)
-    if twice is not None:
-        raise ConfigError(f"scores: recording {twice[0]}, {twice[1]} ns, camera {twice[2]} was measured twice")
-    return ordered
-
-
 def _camera_score(sums: Sequence[ErrorSums]) -> Score:
     measured = [s.metrics() for s in sums if s.predicted]
     truth, predicted = sum(s.truth for s in sums), sum(s.predicted for s in sums)
@@ -293,11 +317,6 @@ def _mean_score(scores: Sequence[Score]) -> Score:
 
 def _means(metrics: Sequence[Mapping[str, float]]) -> dict[str, float]:
     return {name: mean([m[name] for m in metrics]) for name in METRIC_NAMES}
-
-
-def mean(values: Sequence[float]) -> float:
-    """Return the mean, rounded once whatever the order; NaN for no values."""
-    return math.fsum(values) / len(values) if values else math.nan
 
 
 def _json_by_group(scores: Mapping[str, Score]) -> dict[str, Any]:

@@ -18,7 +18,10 @@ CORE = sorted((ROOT / "cvcdepth_core").rglob("*.py"))
 WITHOUT_ROS = [
     *CORE,
     *sorted((ROOT / "cvcdepth_ros/bags").glob("*.py")),
-    *(ROOT / "cvcdepth_ros" / name for name in ("synchronizer.py", "mailbox.py", "transforms.py", "share.py")),
+    *(
+        ROOT / "cvcdepth_ros" / name
+        for name in ("synchronizer.py", "mailbox.py", "transforms.py", "share.py", "lidar.py")
+    ),
 ]
 IMPORT_ALL_BUT_ROS = f"""
 import importlib, re, sys
