@@ -58,7 +58,12 @@ def _shortest_unique_names(namespaces: list[str]) -> dict[str, str]:
     parts = {namespace: namespace.strip("/").split("/") for namespace in namespaces}
     depth = max((len(found) for found in parts.values()), default=1)
     for count in range(1, depth + 1):
-        names = {namespace: "_".join(found[-count:]) for namespace, found in parts.items()}
+        names = {namespace: _camera_name("_".join(found[-count:])) for namespace, found in parts.items()}
         if len(set(names.values())) == len(names):
             break
-    return names if namespaces else {}
+    return names
+
+
+def _camera_name(topic_part: str) -> str:
+    """Make a camera's name, which begins with a letter, of a part of a topic, which may be empty or a number."""
+    return topic_part if topic_part[:1].isalpha() else f"camera_{topic_part}".rstrip("_")
