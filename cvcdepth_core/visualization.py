@@ -18,7 +18,7 @@ from cvcdepth_core.images import Picture
 from cvcdepth_core.rig import Camera, Rig, order_around_vehicle
 
 Colour = tuple[int, int, int]
-Points = NDArray[np.float32]
+Points = NDArray[np.floating]
 
 _BACKGROUND: Colour = (18, 20, 24)
 _PANEL: Colour = (28, 31, 37)

@@ -21,12 +21,12 @@ from cvcdepth_core.errors import ConfigError, CvcDepthError
 from cvcdepth_core.rig import RigLayout, load_rig_layout
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.commands.arguments import positive
-from cvcdepth_ros.demo.clouds import LidarSweeps
 from cvcdepth_ros.demo.live_run import LiveOutcome, LiveRun
 from cvcdepth_ros.demo.pace import manageable_rate
 from cvcdepth_ros.demo.paths import DemoPaths
 from cvcdepth_ros.demo.processes import children
 from cvcdepth_ros.demo.received import Output, ReceivedSets, node_outputs, sent_sets
+from cvcdepth_ros.demo.recorded_lidar import RecordedLidar
 from cvcdepth_ros.demo.result import UNTRAINED_WARNING, DemoResult
 from cvcdepth_ros.demo.sheets import SheetWriter
 from cvcdepth_ros.settings import ModelSettings
@@ -142,7 +142,7 @@ def _show(setup: Setup, paths: DemoPaths, outcome: LiveOutcome) -> DemoResult:
     with open_recording(setup.recording) as recording:
         sets = sent_sets(recording, setup.layout, _TOLERANCE_SECONDS, outcome.sent)
         received = ReceivedSets(paths.recording, setup.outputs, sets)
-        lidar = LidarSweeps(recording, setup.layout.base_frame)
+        lidar = RecordedLidar(recording, setup.layout)
         writer = SheetWriter(setup.layout.complete(), lidar, paths.sheets, setup.notes(outcome), setup.untrained)
         for _ in tqdm(writer.write(received, len(sets)), desc="drawing", total=outcome.node.published, disable=None):
             pass

@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import dropwhile
 from pathlib import Path
 from typing import IO, Any
 
@@ -73,8 +74,10 @@ class Child:
             return
 
     def result(self) -> dict[str, Any]:
-        """Return the JSON document that it has printed in all; DemoError when it is none. Call it after the end."""
-        printed = "".join(self._lines.get() for _ in range(self._lines.qsize()))
+        """Return the JSON document that it has printed; DemoError when there is none. Call it after the end."""
+        lines = [self._lines.get() for _ in range(self._lines.qsize())]
+        # Where /dev/shm is small, as in Docker, FastDDS says so on stdout, and goes on over UDP.
+        printed = "".join(dropwhile(lambda line: not line.startswith("{"), lines))
         try:
             document: dict[str, Any] = json.loads(printed)
         except ValueError as error:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from cvcdepth_core.rig import RigLayout
 from cvcdepth_core.visualization import ColouredPoints
 from cvcdepth_ros.bags import Recording, open_recording
-from cvcdepth_ros.demo.clouds import coloured_points
 from cvcdepth_ros.messages import picture_from_message, stamp_ns
 from cvcdepth_ros.surround_messages import DEPTH, DEPTH_INFO, MERGED_CLOUD, PICTURE, output_types
 from cvcdepth_ros.synchronizer import SurroundSet, SurroundSynchronizer
@@ -112,7 +111,7 @@ def _received_set(sent: SentSet, parts: Mapping[Output, Any]) -> ReceivedSet:
         sent,
         pictures=np.stack([picture_from_message(of[PICTURE, camera], camera) for camera in sent.stamps_ns]),
         depth=np.stack([_depth(of[DEPTH, camera]) for camera in sent.stamps_ns]),
-        cloud=coloured_points(cloud),
+        cloud=_coloured_points(cloud),
     )
 
 
@@ -125,3 +124,11 @@ def _depth(message: Any) -> NDArray[np.float32]:
     rows = np.frombuffer(message.data, dtype=np.uint8).reshape(message.height, message.step)
     order = ">" if message.is_bigendian else "<"
     return rows[:, : 4 * message.width].view(f"{order}f4").astype(np.float32)
+
+
+def _coloured_points(message: Any) -> ColouredPoints:
+    """Return the node's own cloud, which has x, y, z and rgb as four float32 and nothing else."""
+    cloud = np.frombuffer(message.data, dtype=">f4" if message.is_bigendian else "<f4").reshape(-1, 4)
+    packed = cloud[:, 3].astype(np.float32).view(np.uint32)
+    rgb = np.stack([packed >> shift & 0xFF for shift in (16, 8, 0)], axis=-1).astype(np.uint8)
+    return ColouredPoints(cloud[:, :3].astype(np.float32), rgb)

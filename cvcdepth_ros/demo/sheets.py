@@ -11,9 +11,9 @@ from cvcdepth_core.errors import TransformError
 from cvcdepth_core.images import Picture
 from cvcdepth_core.rig import Rig
 from cvcdepth_core.visualization import Points, SurroundPictures, contact_sheet
-from cvcdepth_ros.demo.clouds import LidarSweeps
 from cvcdepth_ros.demo.page import Table, animation_page
 from cvcdepth_ros.demo.received import ReceivedSet
+from cvcdepth_ros.demo.recorded_lidar import RecordedLidar
 from cvcdepth_ros.demo.result import UNTRAINED_WARNING, DemoResult
 from cvcdepth_ros.synchronizer import NANOSECONDS
 
@@ -24,7 +24,7 @@ _PNG_COMPRESSION = 6
 class SheetWriter:
     """Draws sets, writes each as PNG, and keeps a JPEG of each for the page."""
 
-    def __init__(self, rig: Rig, lidar: LidarSweeps, folder: Path, notes: list[str], untrained: bool) -> None:
+    def __init__(self, rig: Rig, lidar: RecordedLidar, folder: Path, notes: list[str], untrained: bool) -> None:
         """Draw for one rig and recording into `folder`; `notes` are the last lines below every picture."""
         self._rig = rig
         self._lidar = lidar
@@ -65,7 +65,7 @@ class SheetWriter:
         """Return the LiDAR's points at the set's stamp, and what the caption says of them."""
         seen = "Right: the scene from above, grid 10 m; the merged cloud in its own colours, brightened"
         try:
-            points = self._lidar.nearest(surround.sent.stamp_ns, surround.sent.images[self._rig.anchor])
+            points = self._lidar.at(surround.sent.stamp_ns, surround.sent.images[self._rig.anchor])
         except TransformError as error:
             return None, f"{seen}, no LiDAR ({error})"
         return points, f"{seen}, {'LiDAR in cyan' if points is not None else 'no LiDAR recorded'}"

@@ -1,0 +1,499 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The demo as its users meet it: processes over DDS, honest counts, pictures, and nothing left running."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="these tests need a ROS environment")
+
+from cvcdepth_core.rig import RigLayout
+from cvcdepth_ros.bags import RecordingWriter, open_recording
+from cvcdepth_ros.demo.node_report import Latency, NodeReport, read_report
+from cvcdepth_ros.demo.page import animation_page
+from cvcdepth_ros.demo.processes import Child, Children, DemoError, free_domain
+from cvcdepth_ros.demo.received import Output, ReceivedSets, SentSet, node_outputs, sent_sets
+from cvcdepth_ros.demo.recorded_lidar import RecordedLidar
+from cvcdepth_ros.demo.result import DemoResult
+from cvcdepth_ros.messages import bag_message_factory
+from cvcdepth_ros.recorded_rig import discover_rig
+from tests.recordings import CAMERAS, JAZZY, SAMPLE
+
+NODE = "/surround_depth"
+TIMEOUT = 60.0
+SMALL = ("--height", "64", "--width", "96", "--rate", "0.1")
+
+# A node that knows nothing of ours: it tells diagnostics all the time, and publishes once it is subscribed.
+PUBLISHER = f"""
+import sys, time
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from sensor_msgs.msg import Image
+rclpy.init()
+node = rclpy.create_node("surround_depth")
+diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+images = node.create_publisher(Image, "{NODE}/front/image_rect", 10)
+status = DiagnosticStatus(name="surround_depth: node", hardware_id="{NODE}", message="active")
+while not images.get_subscription_count():
+    diagnostics.publish(DiagnosticArray(status=[status]))
+    time.sleep(0.1)
+for i in range(20):
+    image = Image(height=300, width=400, step=400, encoding="mono8", data=bytes([i]) * 120_000)
+    image.header.stamp.sec = i
+    images.publish(image)
+    images.wait_for_all_acked()
+while True:
+    diagnostics.publish(DiagnosticArray(status=[status]))
+    time.sleep(0.1)
+"""
+
+
+def wait_for(condition: Callable[[], Any], what: str, seconds: float = TIMEOUT) -> Any:
+    deadline = time.monotonic() + seconds
+    while not (value := condition()):
+        assert time.monotonic() < deadline, f"waited {seconds} s in vain for {what}"
+        time.sleep(0.05)
+    return value
+
+
+# The whole demo
+
+
+@pytest.fixture(scope="module")
+def finished_demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, "subprocess.CompletedProcess[str]"]:
+    output = tmp_path_factory.mktemp("demo")
+    command = [sys.executable, "-m", "cvcdepth_ros.demo", "--output", str(output), *SMALL]
+    return output, subprocess.run(command, capture_output=True, text=True, timeout=100)
+
+
+def test_every_set_is_sent_matched_published_and_received(finished_demo: Any):
+    output, process = finished_demo
+    assert process.returncode == 0, process.stdout + process.stderr
+    result = json.loads((output / "demo.json").read_text())
+    sets = result["node"]["sets"]
+    assert (result["sent"], sets["matched"], sets["published"], result["received"]) == (10, 10, 10, 10)
+    assert (result["images_sent"], sum(result["node"]["images_lost"].values())) == (60, 0)
+    assert result["messages_lost"] == {}
+    received = {topic: count for topic, count in result["messages_received"].items() if topic.startswith(NODE)}
+    assert set(received.values()) == {10}
+    assert len(received) == 3 * len(CAMERAS) + 1
+
+
+def test_the_table_on_the_terminal_says_what_the_file_says(finished_demo: Any):
+    output, process = finished_demo
+    result = json.loads((output / "demo.json").read_text())
+    lines = [line.split() for line in process.stdout.splitlines()]
+    assert ["sets", "received", "complete", "10"] in lines
+    inference = result["node"]["latencies"]["inference"]
+    assert ["inference", f"{inference['p50_ms']:.1f}", f"{inference['p95_ms']:.1f}"] in lines
+
+
+def test_an_untrained_network_is_called_so(finished_demo: Any):
+    output, process = finished_demo
+    assert process.stdout.splitlines()[0].startswith("UNTRAINED NETWORK: this depth means nothing")
+    assert "UNTRAINED NETWORK: this depth means nothing" in (output / "demo.html").read_text()
+    assert json.loads((output / "demo.json").read_text())["untrained"] is True
+
+
+def test_every_set_has_its_picture_and_none_is_like_another(finished_demo: Any):
+    output, _ = finished_demo
+    sheets = [cv2.imread(str(path)) for path in sorted((output / "sets").iterdir())]
+    assert len(sheets) == 10
+    assert {sheet.shape for sheet in sheets} == {sheets[0].shape}
+    for one, other in pairwise(sheets):
+        assert (one != other).mean() > 0.05
+
+
+def test_the_page_holds_every_set_and_loads_nothing(finished_demo: Any):
+    output, _ = finished_demo
+    page = (output / "demo.html").read_text()
+    assert page.count('src="data:image/jpeg;base64,') == page.count("src=") == 10
+    assert "href" not in page
+    assert "://" not in page
+
+
+def test_the_recording_holds_what_was_published_and_nothing_else(finished_demo: Any):
+    output, _ = finished_demo
+    with open_recording(output / "recording") as recording:
+        outputs = {entry.topic for entry in node_outputs(NODE, CAMERAS, "front")}
+        assert recording.topics.keys() == outputs | {"/diagnostics"}
+        assert {recording.topics[topic].count for topic in outputs} == {10}
+        depth = next(iter(recording.messages([f"{NODE}/left/depth/image_rect"])))
+        assert recording.deserialize(depth).encoding == "32FC1"
+
+
+# Failures, and the end of the processes
+
+
+class RunningDemo:
+    """A demo that has its node running."""
+
+    def __init__(self, output: Path) -> None:
+        self.output = output
+        command = [sys.executable, "-m", "cvcdepth_ros.demo", "--output", str(output), *SMALL]
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        wait_for(self._node_runs, "the node and the recorder")
+        self.children = self._find_children()
+
+    def child(self, module: str) -> int:
+        return next(pid for pid, command in self.children.items() if module in command)
+
+    def end(self) -> tuple[int, str]:
+        """Return exit code and what was said on stderr; nothing may be left."""
+        _, errors = self.process.communicate(timeout=TIMEOUT)
+        left = [pid for pid in self.children if Path(f"/proc/{pid}").exists()]
+        assert not left, f"still running: {[self.children[pid] for pid in left]}"
+        return self.process.returncode, errors
+
+    def _node_runs(self) -> bool:
+        assert self.process.poll() is None, self.process.communicate()
+        log = self.output / "logs" / "node.log"
+        return log.exists() and "model:" in log.read_text() and len(self._find_children()) >= 2
+
+    def _find_children(self) -> dict[int, str]:
+        """Command line by pid."""
+        found = {}
+        for status in Path("/proc").glob("[0-9]*/stat"):
+            try:
+                parent = int(status.read_text().rpartition(")")[2].split()[1])
+                command = (status.parent / "cmdline").read_text().replace("\0", " ")
+            except OSError:
+                continue  # it has ended meanwhile
+            if parent == self.process.pid:
+                found[int(status.parent.name)] = command
+        return found
+
+
+@pytest.fixture
+def running_demo(tmp_path: Path) -> Iterator[RunningDemo]:
+    demo = RunningDemo(tmp_path / "demo")
+    yield demo
+    if demo.process.poll() is None:
+        demo.process.terminate()
+        demo.process.communicate(timeout=TIMEOUT)
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_ends_the_demo_and_its_processes(running_demo: RunningDemo, number: int, code: int):
+    running_demo.process.send_signal(number)
+    returned, errors = running_demo.end()
+    assert returned == code
+    assert "Traceback" not in errors
+
+
+def test_a_node_that_dies_fails_the_demo_with_its_last_lines(running_demo: RunningDemo):
+    os.kill(running_demo.child("surround_depth_node"), signal.SIGKILL)
+    returned, errors = running_demo.end()
+    assert returned == 1
+    assert "demo: node ended with code -9" in errors
+    assert "untrained: the network has random weights" in errors
+
+
+def test_a_recording_that_is_not_there_is_named(tmp_path: Path):
+    command = [sys.executable, "-m", "cvcdepth_ros.demo", "--output", str(tmp_path), "--recording", "/no/such.mcap"]
+    process = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT)
+    assert process.returncode == 1
+    assert "/no/such.mcap: does not exist" in process.stderr
+
+
+@pytest.fixture
+def start_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], Child]]:
+    """Start Python text as a child of the demo."""
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    family = Children(tmp_path)
+
+    def start(text: str) -> Child:
+        (tmp_path / "a_program.py").write_text(text)
+        return family.start("program", "a_program")
+
+    yield start
+    family.stop()
+
+
+def test_a_process_that_ignores_signals_is_killed(
+    start_program: Callable[[str], Child], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("cvcdepth_ros.demo.processes._STOP_SECONDS", 0.2)
+    ignore = "import signal\nfor s in (2, 15): signal.signal(s, signal.SIG_IGN)\n"
+    child = start_program(ignore + "print('{}', flush=True)\nwhile True: signal.pause()")
+    wait_for(lambda: list(child.reports(0.1)), "its first line")
+    child.stop()
+    with pytest.raises(DemoError, match="program ended with code -9"):
+        child.ended()
+
+
+def test_a_document_is_found_behind_other_lines(start_program: Callable[[str], Child]):
+    child = start_program("print('dds: an error')\nprint('{\\n  \"a\": 1\\n}')")
+    wait_for(lambda: child.ended(0.1), "its end")
+    assert child.result() == {"a": 1}
+
+
+def test_a_program_that_prints_no_document_is_named_with_its_last_lines(start_program: Callable[[str], Child]):
+    child = start_program("print('something else')")
+    wait_for(lambda: child.ended(0.1), "its end")
+    with pytest.raises(DemoError, match=r"program printed no JSON(.|\n)*something else"):
+        child.result()
+
+
+def test_the_domain_of_the_user_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("ROS_DOMAIN_ID", "77")
+    assert Children(tmp_path).domain == "77"
+    monkeypatch.delenv("ROS_DOMAIN_ID")
+    assert 1 <= int(Children(tmp_path).domain) <= 101
+
+
+# The recorder
+
+
+@pytest.fixture
+def environment() -> dict[str, str]:
+    return os.environ | {"ROS_DOMAIN_ID": str(free_domain()), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+
+
+def start_recorder(output: Path, environment: dict[str, str], *options: str) -> "subprocess.Popen[str]":
+    topic = ("--topic", f"{NODE}/front/image_rect", "sensor_msgs/msg/Image")
+    command = [sys.executable, "-m", "cvcdepth_ros.demo.recorder", str(output), *topic, *options]
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+
+
+@pytest.fixture
+def publisher(environment: dict[str, str]) -> Iterator[None]:
+    process = subprocess.Popen([sys.executable, "-c", PUBLISHER], env=environment, stderr=subprocess.DEVNULL)
+    yield
+    process.kill()
+    process.wait()
+
+
+@pytest.mark.usefixtures("publisher")
+def test_the_recorder_stores_every_message_until_it_is_interrupted(tmp_path: Path, environment: dict[str, str]):
+    recorder = start_recorder(tmp_path / "out", environment)
+    assert recorder.stdout is not None
+    topic = f"{NODE}/front/image_rect"
+    for line in recorder.stdout:
+        report = json.loads(line)
+        if report["received"][topic] == 20:
+            break
+    assert report["ready"] is True
+    recorder.send_signal(signal.SIGINT)
+    summary = json.loads(recorder.communicate(timeout=TIMEOUT)[0].splitlines()[-1])
+    assert recorder.returncode == 0
+    assert summary["received"][topic] == 20
+    assert summary["lost"] == {}
+    with open_recording(tmp_path / "out") as recording:
+        assert recording.damage is None
+        assert recording.topics.keys() == {topic, "/diagnostics"}
+        images = [recording.deserialize(message) for message in recording.messages([topic])]
+    assert [image.header.stamp.sec for image in images] == list(range(20))
+    assert all((image.data == i).all() and image.data.size == 120_000 for i, image in enumerate(images))
+
+
+@pytest.mark.usefixtures("publisher")
+def test_the_recorder_ends_by_itself_when_only_diagnostics_come(tmp_path: Path, environment: dict[str, str]):
+    recorder = start_recorder(tmp_path / "out", environment, "--idle-seconds", "3")
+    output, _ = recorder.communicate(timeout=TIMEOUT)
+    assert recorder.returncode == 0
+    assert json.loads(output.splitlines()[-1])["received"][f"{NODE}/front/image_rect"] == 20
+
+
+def test_the_recorder_refuses_an_unknown_type_and_an_existing_folder(tmp_path: Path, environment: dict[str, str]):
+    command = [sys.executable, "-m", "cvcdepth_ros.demo.recorder"]
+    for options, text in (
+        ([str(tmp_path / "new"), "--topic", "/a", "no_such_msgs/msg/Thing"], "no_such_msgs/msg/Thing"),
+        ([str(tmp_path)], "exists already"),
+    ):
+        process = subprocess.run([*command, *options], env=environment, capture_output=True, text=True, timeout=TIMEOUT)
+        assert process.returncode == 1
+        assert process.stderr.startswith("recorder: ")
+        assert text in process.stderr
+
+
+# What counts as sent and received
+
+
+@pytest.fixture(scope="module")
+def layout() -> RigLayout:
+    with open_recording(SAMPLE) as recording:
+        return discover_rig(recording)
+
+
+def sets_of_sample(layout: RigLayout, **fewer: int) -> list[SentSet]:
+    """The sample's sets when of the named cameras only so many images are sent."""
+    sent = {camera.image_topic: fewer.get(camera.name, 10) for camera in layout.cameras}
+    with open_recording(SAMPLE) as recording:
+        return sent_sets(recording, layout, 0.1, sent)
+
+
+def test_a_set_counts_as_sent_only_with_all_its_images(layout: RigLayout):
+    assert len(sets_of_sample(layout)) == 10
+    assert len(sets_of_sample(layout, right=7)) == 7
+    assert sets_of_sample(layout, back=0) == []
+
+
+def write_outputs(
+    folder: Path, outputs: list[Output], sets: list[SentSet], drop: Callable[[Output, int], bool]
+) -> None:
+    """What a recorder gets from a node that publishes these sets; `drop` says which messages are lost."""
+    factory = bag_message_factory()
+    depth, picture = np.full((4, 6), 5.0, dtype=np.float32), np.zeros((4, 6, 3), dtype=np.uint8)
+    depth[0, 0] = np.nan
+    cloud = np.array([[1, 2, 3, 0]], dtype=np.float32)
+    cloud[:, 3] = np.array([0x112233], dtype=np.uint32).view(np.float32)
+    with RecordingWriter(folder) as writer:
+        for output in outputs:
+            writer.add_topic(output.topic, output.type_name)
+        for sent in sets:
+            for output in outputs:
+                stamp = sent.stamps_ns[output.camera]
+                messages = {
+                    "depth/image_rect": factory.depth_image(stamp, "f", depth, "32FC1"),
+                    "image_rect": factory.colour_image(stamp, "f", picture),
+                    "depth/camera_info": factory.camera_info(stamp, "f", np.eye(3), 4, 6),
+                    "points": factory.point_cloud(stamp, "base_link", cloud),
+                }
+                if not drop(output, sent.sequence):
+                    writer.write(output.topic, sent.stamp_ns, messages[output.part])
+
+
+def test_a_set_counts_as_received_only_with_all_its_messages(tmp_path: Path, layout: RigLayout):
+    outputs, sets = node_outputs(NODE, layout.names, "front"), sets_of_sample(layout)
+    lost = f"{NODE}/left/depth/image_rect"
+    write_outputs(tmp_path / "bag", outputs, sets, lambda output, index: output.topic == lost and index in (3, 8))
+    received = ReceivedSets(tmp_path / "bag", outputs, sets)
+    complete = list(received)
+    assert [surround.sent.sequence for surround in complete] == [0, 1, 2, 4, 5, 6, 7, 9]
+    assert received.missing == {3: [lost], 8: [lost]}
+    first = complete[0]
+    assert first.depth.shape == (6, 4, 6)
+    assert np.isnan(first.depth[:, 0, 0]).all()
+    assert (first.depth[:, 1:] == 5).all()
+    assert first.pictures.shape == (6, 4, 6, 3)
+    assert first.cloud.xyz.tolist() == [[1, 2, 3]]
+    assert first.cloud.rgb.tolist() == [[0x11, 0x22, 0x33]]
+
+
+def test_messages_with_stamps_that_nobody_sent_are_no_set(tmp_path: Path, layout: RigLayout):
+    outputs, sets = node_outputs(NODE, layout.names, "front"), sets_of_sample(layout)
+    write_outputs(tmp_path / "bag", outputs, sets, lambda output, index: False)
+    others = ReceivedSets(tmp_path / "bag", outputs, sets[:4])
+    assert len(list(others)) == 4
+    assert others.foreign == {output.topic: 6 for output in outputs}
+
+
+def test_the_lidar_is_there_for_every_set_of_the_sample(layout: RigLayout):
+    with open_recording(SAMPLE) as recording:
+        lidar = RecordedLidar(recording, layout)
+        for sent in sets_of_sample(layout):
+            points = lidar.at(sent.stamp_ns, sent.images["front"])
+            assert points is not None
+            assert len(points) > 20_000
+            # The road, seen in the base frame, is below the cameras.
+            assert np.percentile(points[:, 2], 20) < min(c.base_T_camera[2, 3] for c in layout.complete().cameras)
+
+
+def diagnostics(published: int, matched: int = 10, replaced: int = 0) -> Any:
+    """The node's DiagnosticArray, in the words of its diagnostics module."""
+    from diagnostic_msgs.msg import DiagnosticArray
+
+    from cvcdepth_ros.diagnostics import OK, camera_status, latency_status, status, synchronisation_status
+    from cvcdepth_ros.latencies import StageLatencies
+    from cvcdepth_ros.mailbox import MailboxStatistics
+    from cvcdepth_ros.synchronizer import CameraStatistics, SynchronizerStatistics
+
+    cameras = {
+        name: CameraStatistics(12, 10, 0, {"unmatched": 1, "duplicate_stamp": 1}, 0, 10**8)
+        for name in ("front", "back")
+    }
+    latencies = StageLatencies()
+    for milliseconds in (10, 20, 30):
+        latencies.record("inference", milliseconds / 1000)
+    mailbox = MailboxStatistics(received=matched, delivered=matched - replaced, replaced=replaced)
+    counters = {"published": published, "skipped: no subscriber": 0, "refused": 0}
+    statuses = [
+        status(OK, "node", "active"),
+        *(camera_status(name, None, values, lost=3) for name, values in cameras.items()),
+        synchronisation_status(SynchronizerStatistics(matched, cameras), mailbox, counters),
+        latency_status(latencies.summaries(), OK, "a model"),
+    ]
+    for entry in statuses:
+        entry.name = f"surround_depth: {entry.name}"
+        entry.hardware_id = NODE
+    return DiagnosticArray(status=statuses)
+
+
+def test_the_nodes_diagnostics_are_read_as_it_writes_them():
+    report = read_report(diagnostics(published=8, replaced=2), NODE)
+    assert report is not None
+    assert (report.matched, report.published, report.dropped) == (10, 8, {"replaced": 2})
+    assert report.images_lost == {"front": 3, "back": 3}
+    assert report.images_dropped == {"unmatched": 2, "duplicate_stamp": 2}
+    assert report.latencies == {"inference": Latency(p50_ms=20, p95_ms=29)}
+    assert (report.model, report.error) == ("a model", "")
+
+
+def test_recorded_diagnostics_are_read_like_live_ones():
+    from rclpy.serialization import serialize_message
+
+    live = diagnostics(published=8, replaced=2)
+    recorded = JAZZY.deserialize_cdr(serialize_message(live), "diagnostic_msgs/msg/DiagnosticArray")
+    assert read_report(recorded, NODE) == read_report(live, NODE)
+
+
+def test_diagnostics_of_another_node_are_passed_over():
+    assert read_report(diagnostics(published=8), "/another") is None
+
+
+def test_a_set_under_way_is_not_settled():
+    settled = {published: read_report(diagnostics(published, replaced=2), NODE) for published in (7, 8)}
+    assert [report is not None and report.settled() for report in settled.values()] == [False, True]
+
+
+def test_what_makes_the_node_useless_is_its_error():
+    message = diagnostics(published=0)
+    message.status[0].level, message.status[0].message = b"\x02", "no such rig"
+    report = read_report(message, NODE)
+    assert report is not None
+    assert report.error == "no such rig"
+
+
+def result_of(sent: int, matched: int, published: int, received: int) -> DemoResult:
+    node = NodeReport(sets={"matched": matched, "published": published, "replaced": matched - published})
+    nothing: dict[str, Any] = {"incomplete": {}, "messages_received": {}, "messages_lost": {}, "parameters": {}}
+    counts = {"sent": sent, "received": received, "images_sent": 6 * sent}
+    return DemoResult(version="0", recording="bag", rate=1, untrained=True, node=node, **counts, **nothing)
+
+
+def test_a_run_is_good_when_all_was_matched_and_all_that_was_published_arrived():
+    assert result_of(10, 10, 10, 10).problems() == []
+    assert result_of(10, 10, 7, 7).problems() == []
+    assert "3 replaced" in result_of(10, 10, 7, 7).text()
+
+
+@pytest.mark.parametrize(
+    ("counts", "problem"),
+    [
+        ((10, 9, 9, 9), "10 sets were sent complete, but 9 matched"),
+        ((10, 10, 10, 9), "10 sets were published, but 9 received"),
+        ((10, 10, 0, 0), "no set was published: 10 replaced"),
+        ((0, 0, 0, 0), "the recording has no set"),
+    ],
+)
+def test_a_run_is_bad_when_sets_went_missing(counts: tuple[int, int, int, int], problem: str):
+    assert any(problem in found for found in result_of(*counts).problems())
+
+
+def test_the_page_shows_text_as_text():
+    evil = "<script>alert('x')</script>"
+    page = animation_page(evil, evil, [b"jpeg"], [(evil, [(evil, evil)])], [evil])
+    assert page.count("<script>") == 1
+    assert page.count("&lt;script&gt;alert(&#x27;x&#x27;)&lt;/script&gt;") == 7
