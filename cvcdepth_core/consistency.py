@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from cvcdepth_core.errors import ConfigError
 from cvcdepth_core.estimator import SurroundDepth
@@ -233,7 +234,10 @@ def _contradicted(pair: _Pair, in_other: Tensor, shortening: Tensor) -> Tensor:
     surface = transform(view_T_other, in_other * shortening.flatten(-2))
     grid, z = sampling_grid(surface, pair.intrinsics, pair.depth.shape[-2:])
     z = z.view(pair.depth.shape)
-    contradicted: Tensor = (z > 0) & (_depth_at(pair.depth, grid) > z * (1 + _OCCLUDER_MARGIN))
+    nearness = torch.where(torch.isnan(pair.depth), torch.inf, 1 / pair.depth)
+    # Silhouettes fall between pixels: no pixel around may have a surface as near as that one.
+    nearest = sample(max_pool2d(nearness, 3, stride=1, padding=1), grid.nan_to_num(_OUTSIDE), mode="nearest")
+    contradicted: Tensor = (z > 0) & (nearest > 0) & (nearest * z * (1 + _OCCLUDER_MARGIN) < 1)
     return contradicted
 
 

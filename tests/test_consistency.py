@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Consistency on a ray-cast street: flat ground, a far wall, and a post in front of it."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cvcdepth_core.calibration import Calibration
+from cvcdepth_core.consistency import (
+    Agreement,
+    AgreementRow,
+    PosedDepth,
+    agreement,
+    disagreement,
+    spatial_rows,
+    summarise_agreement,
+    temporal_rows,
+)
+from cvcdepth_core.errors import ConfigError
+from cvcdepth_core.estimator import SurroundDepth
+from cvcdepth_core.pointcloud import pixel_rays
+from cvcdepth_core.rig import Camera, Rig
+
+HEIGHT, WIDTH, FOCAL = 96, 160, 110.0
+K = np.array([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]])
+FORWARD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+WALL, POST = 12.0, (6.0, -0.6, 0.6)  # x of the wall; x and the range of y of the post
+
+
+def turned(degrees: float) -> np.ndarray:
+    angle = math.radians(degrees)
+    pose = np.eye(4)
+    pose[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
+    return pose
+
+
+def camera(name: str, y: float, yaw: float) -> Camera:
+    base_T_camera = turned(yaw) @ FORWARD
+    base_T_camera[:3, 3] = 0.0, y, 1.5
+    calibration = Calibration(width=WIDTH, height=HEIGHT, k=tuple(K.ravel()))
+    return Camera(name, calibration, base_T_camera)
+
+
+RIG = Rig((camera("left", 0.4, 8.0), camera("right", -0.4, -8.0)), "base_link", "left", {})
+
+
+def cast(world_T_camera: np.ndarray, post: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Depth [H, W] and picture [H, W, 3] of the street."""
+    rays = pixel_rays(K, HEIGHT, WIDTH).astype(np.float64) @ world_T_camera[:3, :3].T
+    origin = world_T_camera[:3, 3]
+    with np.errstate(divide="ignore"):
+        ground = np.where(rays[..., 2] < 0, -origin[2] / rays[..., 2], np.inf)
+        depth = np.minimum(ground, (WALL - origin[0]) / rays[..., 0])
+        at_post = (POST[0] - origin[0]) / rays[..., 0]
+    y = origin[1] + at_post * rays[..., 1]
+    on_post = post & (y > POST[1]) & (y < POST[2]) & (at_post < depth)
+    depth = np.where(on_post, at_post, depth)
+    x, y, z = np.moveaxis(origin + rays * depth[..., None], -1, 0)
+    waves = [np.sin(2.1 * y + 1.3 * z + x), np.cos(1.7 * x - 2.3 * y), np.sin(1.9 * z - 0.8 * y + 0.5 * x)]
+    return depth.astype(np.float32), np.rint(127 + 100 * np.stack(waves, axis=-1)).astype(np.uint8)
+
+
+def seen(world_T_base: np.ndarray | None = None, post: bool = True) -> PosedDepth:
+    """What the rig sees from a place, with the right depth and the right poses."""
+    poses = [(np.eye(4) if world_T_base is None else world_T_base) @ camera.base_T_camera for camera in RIG.cameras]
+    depth, pictures = map(np.stack, zip(*(cast(pose, post) for pose in poses), strict=True))
+    surround = SurroundDepth(depth, pictures, np.stack([K, K]))
+    return PosedDepth.of(surround, RIG, None if world_T_base is None else [world_T_base] * 2)
+
+
+def with_depth(posed: PosedDepth, depth: np.ndarray) -> PosedDepth:
+    surround = SurroundDepth(depth.astype(np.float32), posed.surround.pictures, posed.surround.intrinsics)
+    return PosedDepth(surround, posed.world_T_camera)
+
+
+def test_right_geometry_agrees_between_cameras_and_explains_the_pictures():
+    view = seen()
+    for i, j in ((0, 1), (1, 0)):
+        found = agreement(view, i, view, j)
+        assert found.pixels > 0.4 * HEIGHT * WIDTH
+        assert found.median < 1e-4
+        assert found.percentile_90 < 1e-3
+        assert found.photometric < 0.03
+
+
+@pytest.mark.parametrize(("axis", "least_90"), [("up", 0.04), ("aside", 0.005)])
+def test_one_extrinsic_turned_by_one_degree_is_seen(axis, least_90):
+    """Turned aside, depth of a wall ahead hardly changes, and the pictures tell."""
+    view = seen()
+    poses = view.world_T_camera.copy()
+    turn = turned(1.0)[:3, :3]
+    right_R_turned = {"aside": turn[[[0], [2], [1]], [0, 2, 1]], "up": turn[[[2], [0], [1]], [2, 0, 1]]}[axis]
+    poses[1, :3, :3] = poses[1, :3, :3] @ right_R_turned
+    wrong = PosedDepth(view.surround, poses)
+    right, found = agreement(view, 0, view, 1), agreement(wrong, 0, wrong, 1)
+    assert found.median > 100 * right.median
+    assert found.percentile_90 > least_90
+    assert found.photometric > 3 * right.photometric
+
+
+def test_what_the_post_hides_from_the_other_camera_is_not_counted():
+    view = seen()
+    # The post covers some ground and wall for the right camera that the left one sees.
+    difference = disagreement(view, 0, view, 1)
+    z_in_right = _right_camera_depth_of_left_pixels(view)
+    assert (z_in_right > 1.2).sum() > 100  # truly hidden: the other's depth is much smaller
+    assert np.isnan(difference[z_in_right > 1.2]).all()
+    assert (difference > 0.02).sum() < 20  # along silhouettes, which lie between the other's pixels
+
+
+def _right_camera_depth_of_left_pixels(view: PosedDepth) -> np.ndarray:
+    """z in the right camera over the depth that it has there, by a plain loop; 0 outside."""
+    left, right = view.world_T_camera
+    right_T_left = np.linalg.inv(right) @ left
+    ratio = np.zeros((HEIGHT, WIDTH))
+    rays = pixel_rays(K, HEIGHT, WIDTH)
+    for v in range(HEIGHT):
+        for u in range(WIDTH):
+            x, y, z = right_T_left[:3, :3] @ (rays[v, u] * view.surround.depth[0, v, u]) + right_T_left[:3, 3]
+            column, row = FOCAL * x / z + K[0, 2], FOCAL * y / z + K[1, 2]
+            if z > 0 and 0 <= round(column) < WIDTH and 0 <= round(row) < HEIGHT:
+                ratio[v, u] = z / view.surround.depth[1, round(row), round(column)]
+    return ratio
+
+
+def test_a_surface_that_one_camera_invents_is_counted_since_the_other_sees_through_it():
+    view = seen(post=False)
+    depth = view.surround.depth.copy()
+    depth[1, 20:70, 30:90] = 4.0
+    difference = disagreement(with_depth(view, depth), 0, with_depth(view, depth), 1)
+    assert (difference > 0.3).sum() > 1000
+
+
+def test_a_scaled_camera_disagrees_by_its_scale():
+    view = seen(post=False)
+    depth = view.surround.depth * np.array([1.0, 1.2])[:, None, None]
+    scaled = with_depth(view, depth)
+    assert agreement(scaled, 0, scaled, 1).median == pytest.approx(2 * 0.2 / 2.2, abs=0.02)
+
+
+def test_far_points_and_unknown_ones_are_not_compared():
+    view = seen()
+    none = with_depth(view, np.full_like(view.surround.depth, np.nan))
+    assert agreement(view, 0, none, 1).pixels == agreement(none, 0, view, 1).pixels == 0
+    assert math.isnan(agreement(none, 0, view, 1).photometric)
+    near = disagreement(view, 0, view, 1, max_depth=5.0)
+    assert np.isnan(near[view.surround.depth[0] >= 5.0]).all()
+    assert not np.isnan(near).all()
+
+
+def test_cameras_that_share_no_view_give_nothing():
+    view = seen()
+    away = PosedDepth(view.surround, np.stack([view.world_T_camera[0], turned(180) @ view.world_T_camera[1]]))
+    found = agreement(away, 0, away, 1)
+    assert found.pixels == 0
+    assert all(map(math.isnan, found[1:]))
+
+
+def test_depth_agrees_along_the_recorded_motion_and_not_along_a_wrong_one():
+    far_away = np.array([5e5, 4e6, 30.0])  # UTM coordinates must not cost precision
+    here, there = np.eye(4), np.eye(4)
+    there[:3, 3] = 0.5, 0.1, 0.0
+    earlier, later = seen(here), seen(there)
+    shifted = [
+        PosedDepth(p.surround, p.world_T_camera + np.pad(far_away[:, None], ((0, 1), (3, 0)))) for p in (earlier, later)
+    ]
+    for first, second in ((later, earlier), (shifted[1], shifted[0])):
+        rows = temporal_rows("drive", 100, RIG, first, second, 80.0)
+        assert [(row.camera, row.other, row.kind) for row in rows] == [
+            ("left", "left", "temporal"),
+            ("right", "right", "temporal"),
+        ]
+        for row in rows:
+            assert row.travelled == pytest.approx(math.hypot(0.5, 0.1))
+            assert row.agreement.median < 1e-3
+            assert row.agreement.photometric < 0.03
+    still = PosedDepth(later.surround, earlier.world_T_camera)
+    assert temporal_rows("drive", 100, RIG, still, earlier, 80.0)[0].agreement.median > 0.02
+
+
+def test_the_vehicles_motion_between_two_exposures_is_taken_into_account():
+    moved = np.eye(4)
+    moved[:3, 3] = 0.6, 0.0, 0.0
+    first, second = seen(np.eye(4)), seen(moved)
+    surround = SurroundDepth(
+        np.stack([first.surround.depth[0], second.surround.depth[1]]),
+        np.stack([first.surround.pictures[0], second.surround.pictures[1]]),
+        first.surround.intrinsics,
+    )
+    known = PosedDepth.of(surround, RIG, [np.eye(4), moved])
+    unknown = PosedDepth.of(surround, RIG, None)
+    assert agreement(known, 0, known, 1).median < 1e-3
+    assert agreement(unknown, 0, unknown, 1).median > 0.02
+
+
+def test_every_neighbour_pair_has_a_row_that_survives_json():
+    rows = spatial_rows("drive", 5, RIG, seen(), 80.0)
+    assert [(row.camera, row.other) for row in rows] == [("left", "right"), ("right", "left")]
+    assert rows[0].travelled == pytest.approx(0.8)
+    rows.append(AgreementRow("drive", 6, "spatial", "left", "right", 0.8, Agreement(0, *[math.nan] * 3)))
+    again = [AgreementRow.from_json(json.loads(json.dumps(row.to_json(), allow_nan=False))) for row in rows]
+    assert [repr(row) for row in again] == [repr(row) for row in rows]
+    with pytest.raises(ConfigError, match="not what this version writes"):
+        AgreementRow.from_json({"recording": "drive"})
+
+
+@given(st.permutations(range(6)))
+def test_the_summary_is_the_mean_over_sets_in_any_order_and_passes_over_empty_ones(order):
+    values = [0.1, 0.2, 0.7, 0.3, 1e-9, math.nan]
+    rows = [
+        AgreementRow("drive", i, "spatial", "left", "right", 0.8, Agreement(0 if math.isnan(v) else 9, v, v, v))
+        for i, v in enumerate(values)
+    ]
+    (summary,) = summarise_agreement([rows[i] for i in order]).values()
+    assert summary == (5, *[math.fsum(values[:5]) / 5] * 3)
+
+
+def test_a_comparison_that_is_there_twice_is_refused():
+    row = AgreementRow("drive", 0, "spatial", "left", "right", 0.8, Agreement(1, 0.0, 0.0, 0.0))
+    with pytest.raises(ConfigError, match="drive, 0, spatial, left, right was measured twice"):
+        summarise_agreement([row, row])
