@@ -91,6 +91,12 @@ def test_blocks_widen_the_interval_where_consecutive_sets_are_alike():
     assert widths[1] > 2 * widths[0]
 
 
+def test_blocks_do_not_widen_the_interval_of_independent_sets():
+    pair = predicted(0.2, 0, sets=200), predicted(0.18, 1, sets=200)
+    single, blocks = (compare(*pair, block=block).differences["abs_rel"] for block in (1, 10))
+    assert blocks.high - blocks.low < 1.5 * (single.high - single.low)
+
+
 def test_what_cannot_be_compared_is_refused():
     with pytest.raises(ConfigError, match=r"max_depth=80.*max_depth=50"):
         compare(predicted(0.2), predicted(0.2, config=ScoreSettings(max_depth=50)))
