@@ -3,8 +3,8 @@
 
 Messages go out as the bytes that were recorded, never unpacked. A reliable publisher of large messages waits, before
 each, until its last one was acknowledged: then neither its history nor the shared-memory segment overflows, and nothing
-is lost however slow a subscriber is. Small messages do not wait: FastDDS resends them soon enough, and may acknowledge
-one that travels alone only with the next heartbeat, seconds later.
+is lost however slow a subscriber is. Small messages do not wait: those that FastDDS sends in one piece it may ask to be
+acknowledged only with its next heartbeat, seconds later (measured: 5 ms for 66 kB, up to 3 s for 65 kB).
 """
 
 import time
@@ -30,7 +30,7 @@ CLOCK_TOPIC = "/clock"
 
 _DEFAULT_DEPTH = 100
 _CLOCK_PERIOD = 0.02  # s of wall time
-_LARGE_MESSAGE = 60_000  # bytes; above, DDS splits a message over several packets
+_LARGE_MESSAGE = 66_000  # bytes; above, FastDDS sends a message in fragments
 _ACKNOWLEDGE_SECONDS = 1.0
 _LAST_ACKNOWLEDGE_SECONDS = 5.0
 _WAIT_SECONDS = 0.1

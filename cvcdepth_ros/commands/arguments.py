@@ -6,7 +6,6 @@ import json
 import math
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
 from pydantic import ValidationError
@@ -19,9 +18,7 @@ SettingsT = TypeVar("SettingsT", bound=ModelSettings)
 
 def add_recording(parser: argparse.ArgumentParser) -> None:
     """Declare the recording."""
-    parser.add_argument(
-        "recording", type=Path, metavar="BAG", help="rosbag2 folder, or a single .mcap, .db3 or ROS 1 .bag file"
-    )
+    parser.add_argument("recording", metavar="BAG", help="rosbag2 folder, or a single .mcap, .db3 or ROS 1 .bag file")
 
 
 def add_window(parser: argparse.ArgumentParser) -> None:
@@ -37,18 +34,21 @@ def add_json(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print the result as one JSON document")
 
 
-def add_settings(parser: argparse.ArgumentParser, settings: type[ModelSettings]) -> None:
-    """Declare an option for every field of a settings model; what is not given keeps the model's default."""
+def add_settings(
+    parser: argparse.ArgumentParser, settings: type[ModelSettings], repeatable: Sequence[str] = ()
+) -> "argparse._MutuallyExclusiveGroup":
+    """Declare an option for every field of a settings model; what is not given keeps the model's default.
+
+    Options of `repeatable` fields give lists. Returns the group of those options of which one must be given.
+    """
     network = parser.add_mutually_exclusive_group(required=True)
     for name, field in settings.model_fields.items():
-        group = network if name in ("checkpoint", "untrained") else parser
-        shown = "" if field.default in ("", False) else f" [{field.default}]"
-        group.add_argument(
-            f"--{name.replace('_', '-')}",
-            help=f"{field.description}{shown}",
-            default=argparse.SUPPRESS,
-            **_value_of(field.annotation),
-        )
+        group = network if name in ("checkpoint", "untrained", "predictor") else parser
+        shown = "" if field.default in ("", None) or field.default is False else f" [{field.default}]"
+        reading = _value_of(field.annotation) | ({"action": "append"} if name in repeatable else {})
+        option = f"--{name.replace('_', '-')}"
+        group.add_argument(option, help=f"{field.description}{shown}", default=argparse.SUPPRESS, **reading)
+    return network
 
 
 def settings_from(arguments: argparse.Namespace, settings: type[SettingsT]) -> SettingsT:
@@ -60,7 +60,8 @@ def settings_from(arguments: argparse.Namespace, settings: type[SettingsT]) -> S
     try:
         return settings.model_validate(given)
     except ValidationError as error:
-        arguments.usage_error(f"argument --{first_validation_message(error)}")
+        field, _, reason = first_validation_message(error).partition(":")
+        arguments.usage_error(f"argument --{field.replace('_', '-')}:{reason}")
         raise
 
 
@@ -107,7 +108,9 @@ def non_negative(text: str) -> float:
 
 
 def _value_of(annotation: Any) -> dict[str, Any]:
-    """Return argparse's way of reading a value of this type."""
+    """Return argparse's way of reading a value of this type, or of this type or None."""
+    if type(None) in get_args(annotation):
+        (annotation,) = (kind for kind in get_args(annotation) if kind is not type(None))
     if annotation is bool:
         return {"action": "store_true"}
     if get_origin(annotation) is Literal:

@@ -77,13 +77,15 @@ def execute(arguments: argparse.Namespace) -> None:
 def _play(recording: "Recording", arguments: argparse.Namespace) -> dict[str, Any]:
     from cvcdepth_ros.player import RecordingPlayer
 
-    began = time.monotonic()
     interrupted = False
     with RecordingPlayer(recording, arguments.topics, arguments.clock) as player:
         if player.skipped:
             skipped = ", ".join(f"{topic} ({type_})" for topic, type_ in player.skipped.items())
             warn(f"not played, for want of their message package: {skipped}")
+        began = time.monotonic()
         try:
+            _await_subscribers(player, arguments.wait_for_subscribers)
+            began = time.monotonic()
             _play_through(player, recording, arguments)
         except KeyboardInterrupt:
             interrupted = True
@@ -91,12 +93,14 @@ def _play(recording: "Recording", arguments: argparse.Namespace) -> dict[str, An
         return _result(player, recording, time.monotonic() - began, interrupted)
 
 
+def _await_subscribers(player: "RecordingPlayer", seconds: float) -> None:
+    missing = player.wait_for_subscribers(seconds) if seconds else []
+    if missing:
+        warn(f"no subscriber after {seconds:g} s on {', '.join(missing)}; playing anyway")
+
+
 def _play_through(player: "RecordingPlayer", recording: "Recording", arguments: argparse.Namespace) -> None:
     start, stop = window_ns(arguments, recording.start)
-    if arguments.wait_for_subscribers:
-        missing = player.wait_for_subscribers(arguments.wait_for_subscribers)
-        if missing:
-            warn(f"no subscriber after {arguments.wait_for_subscribers:g} s on {', '.join(missing)}; playing anyway")
     player.play(start, stop, arguments.rate)
     while arguments.loop:
         player.play(start, stop, arguments.rate)

@@ -45,11 +45,12 @@ def execute(arguments: argparse.Namespace) -> None:
         raise ConfigError(f"{arguments.output}: exists already; --force overwrites it")
     with open_recording(arguments.recording) as recording:
         layout = discover_rig(recording, arguments.base_frame)
+        name = recording.path.name
     layout = layout.model_copy(update={"anchor": _anchor(layout, arguments.anchor)})
     result = _describe(layout, layout.complete())
-    source = f"bag_replay rig {package_version()}, from the recording {arguments.recording.resolve().name}"
+    source = f"bag_replay rig {package_version()}, from the recording {name}"
     save_rig_layout(arguments.output, layout, f"Written by {source}.\n{_overlaps_text(result)}")
-    result = {"file": str(arguments.output), "recording": str(arguments.recording), **result}
+    result = {"file": str(arguments.output), "recording": arguments.recording, **result}
     print_result(result, _text(result), arguments.json)
 
 
