@@ -43,10 +43,10 @@ class Sample(NamedTuple):
     after: int
 
 
-def split_stamp(index: RecordingIndex, held_out: float) -> float:
-    """Return the anchor stamp (ns) from which on sets are held out."""
-    first, last = index.stamps[0, index.anchor], index.stamps[-1, index.anchor]
-    return float(last + 1 - held_out * (last - first)) if held_out else float(last + 1)
+def split_stamp(index: RecordingIndex, held_out: float) -> int:
+    """Return the anchor stamp (ns) after which sets are held out."""
+    first, last = (int(stamp) for stamp in index.stamps[[0, -1], index.anchor])
+    return last - round(held_out * (last - first))
 
 
 def find_samples(index: RecordingIndex, config: RecordingsConfig, part: Part, recording: int = 0) -> list[Sample]:
@@ -55,7 +55,7 @@ def find_samples(index: RecordingIndex, config: RecordingsConfig, part: Part, re
     A sample's contexts are the nearest sets before and after the target that the vehicle has moved far enough from.
     """
     stamps = index.stamps[:, index.anchor]
-    held_out = stamps >= split_stamp(index, config.held_out)
+    held_out = stamps > split_stamp(index, config.held_out)
     members = np.flatnonzero(held_out == (part == "held_out"))
     samples = []
     for target in members.tolist():
