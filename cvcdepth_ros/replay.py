@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvcdepth_core.errors import CvcDepthError, RecordingError, RigError
-from cvcdepth_core.estimator import DepthEstimator, SurroundDepth, SurroundDepthEstimator
+from cvcdepth_core.estimator import DepthPredictor, SurroundDepth, SurroundDepthEstimator
 from cvcdepth_core.rig import Rig, RigLayout
 from cvcdepth_ros.bags import RecordedMessage, Recording
 from cvcdepth_ros.latencies import StageLatencies
@@ -167,7 +167,7 @@ class EstimatedSet:
 class DepthReplay:
     """Estimates every set of a replay. A set that cannot be estimated is left out and told in `refused`."""
 
-    def __init__(self, replay: SurroundReplay, estimator: DepthEstimator) -> None:
+    def __init__(self, replay: SurroundReplay, estimator: DepthPredictor) -> None:
         """Prepare for the replay's rig; RigError names a mask that does not fit."""
         self.refused = Refusals()
         self.latencies = StageLatencies()

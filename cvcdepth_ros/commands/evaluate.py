@@ -1,0 +1,261 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`evaluate`: score depth on recordings, against their LiDAR and without it, and compare results."""
+
+import argparse
+import json
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cvcdepth_core.errors import RecordingError
+from cvcdepth_ros.commands.arguments import (
+    add_json,
+    add_settings,
+    add_window,
+    print_result,
+    settings_from,
+    table,
+    warn,
+)
+from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings
+from cvcdepth_ros.version import package_version
+
+if TYPE_CHECKING:
+    from cvcdepth_core.scores import Score
+    from cvcdepth_ros.evaluation.recording import Progress, RecordingScores
+    from cvcdepth_ros.evaluation.result import EvaluationResult, Model
+
+SUMMARY = """Score depth on recordings: against their LiDAR, and without it; or compare two results.
+
+BAG is a recording of any kind, a folder of them, a glob or a URL. Sets are matched, rectified and estimated as the live
+node does it. OUT/metrics.json holds every number (docs/evaluation.md explains them), OUT/per_frame.csv a line per
+image, OUT/report.html the tables and pictures. Recordings that were finished before are not done again."""
+EXAMPLES: tuple[str, ...] = (
+    "evaluate drives/ --checkpoint model.safetensors -o scores --workers 4",
+    "evaluate drive.mcap --predictor ground_plane --ground-height -0.4 -o flat",
+    "evaluate drives/ --checkpoint old.safetensors --checkpoint new.safetensors -o both",
+    "evaluate --compare scores_old/metrics.json scores_new/metrics.json",
+)
+
+_METRICS_FILE, _FRAMES_FILE, _COMPARISON_FILE = "metrics.json", "per_frame.csv", "comparison.json"
+_PARTS = "parts"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("recordings", nargs="*", metavar="BAG", help="recordings, folders of them, globs, URLs")
+    parser.add_argument("-o", "--output", type=Path, default=Path("evaluation"), metavar="OUT", help="[evaluation]")
+    network = add_settings(parser, EvaluationSettings, repeatable=["checkpoint"])
+    network.add_argument(
+        "--compare", nargs=2, type=Path, metavar=("A", "B"), help="two metrics.json: is B better than A?"
+    )
+    lidar = parser.add_mutually_exclusive_group()
+    lidar.add_argument(
+        "--lidar", action="append", metavar="TOPIC", help="a LiDAR; can be repeated [all point clouds of a recording]"
+    )
+    lidar.add_argument("--no-lidar", action="store_true", help="label-free scores only")
+    parser.add_argument("--rig", type=Path, metavar="FILE", help="rig file [the cameras found in each recording]")
+    parser.add_argument(
+        "--base-frame", metavar="FRAME", default="base_link", help="without --rig: the vehicle's frame [base_link]"
+    )
+    add_window(parser)
+    parser.add_argument("--workers", type=_workers, default=1, metavar="N", help="processes, a recording each [1]")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+    add_json(parser)
+
+
+def execute(arguments: argparse.Namespace) -> None:
+    """Evaluate each model on all recordings, or compare; RecordingError when nothing could be evaluated."""
+    if arguments.compare and arguments.recordings:
+        arguments.usage_error("--compare takes two metrics.json and no recording")
+    if not arguments.compare and not arguments.recordings:
+        arguments.usage_error("the following arguments are required: BAG")
+    if arguments.compare:
+        content, text = _comparison(*arguments.compare)
+    else:
+        content, text = _evaluation(arguments)
+    print_result(content, text, arguments.json)
+
+
+def _evaluation(arguments: argparse.Namespace) -> "tuple[dict[str, Any], str]":
+    """Evaluate every model, and compare the others with the first; return what to print."""
+    found = [_evaluated(arguments, settings, folder) for settings, folder in _folders(arguments)]
+    if len(found) == 1:
+        return found[0][1:]
+    (first, *_), *others = found
+    compared = []
+    for folder, *_ in others:
+        content, text = _comparison(first / _METRICS_FILE, folder / _METRICS_FILE)
+        (folder / _COMPARISON_FILE).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        compared.append((content, text))
+    results = {"evaluations": [content for _, content, _ in found], "comparisons": [content for content, _ in compared]}
+    return results, "\n\n".join([text for *_, text in found] + [text for _, text in compared])
+
+
+def _folders(arguments: argparse.Namespace) -> list[tuple[EvaluationSettings, Path]]:
+    """Return the settings for each model with its output folder: OUT itself for one, OUT/NAME for several."""
+    checkpoints = getattr(arguments, "checkpoint", None)
+    if not checkpoints:
+        return [(settings_from(arguments, EvaluationSettings), arguments.output)]
+    given = [argparse.Namespace(**vars(arguments) | {"checkpoint": checkpoint}) for checkpoint in checkpoints]
+    settings = [settings_from(one, EvaluationSettings) for one in given]
+    if len(checkpoints) == 1:
+        return [(settings[0], arguments.output)]
+    names = unique_names([(Path(checkpoint).stem, f"{i}") for i, checkpoint in enumerate(checkpoints, 1)])
+    return [(one, arguments.output / name) for one, name in zip(settings, names, strict=True)]
+
+
+def _evaluated(
+    arguments: argparse.Namespace, settings: EvaluationSettings, folder: Path
+) -> "tuple[Path, dict[str, Any], str]":
+    """Write one model's results; return their folder and what to print."""
+    from cvcdepth_ros.evaluation.frames import to_csv
+
+    if settings.untrained:
+        warn("untrained: the network has random weights, and its depth means nothing")
+    result = _result(arguments, settings, folder)
+    content = result.to_json()
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / _METRICS_FILE).write_text(json.dumps(content) + "\n", encoding="utf-8")
+    (folder / _FRAMES_FILE).write_text(to_csv(result.images), encoding="utf-8")
+    return folder, {name: value for name, value in content.items() if name != "rows"}, _text(result, folder)
+
+
+def _result(arguments: argparse.Namespace, settings: EvaluationSettings, folder: Path) -> "EvaluationResult":
+    from cvcdepth_ros.evaluation.result import EvaluationResult, Failure
+    from cvcdepth_ros.evaluation.workers import KeptParts, evaluate_all
+
+    model, jobs = _model(settings), _jobs(arguments, settings)
+    kept = KeptParts(folder / _PARTS, {"version": package_version(), "sha256": model.sha256})
+    scores, failed = [], []
+    with _progress(len(jobs), arguments.quiet) as progress:
+        for job, outcome in evaluate_all(jobs, arguments.workers, kept, progress):
+            if isinstance(outcome, Failure):
+                failed.append(outcome)
+            else:
+                scores.append(outcome)
+                _warn_of_damage(job, outcome)
+    for failure in failed:
+        warn(f"not evaluated: {failure.reason}")
+    if not scores:
+        raise RecordingError(f"nothing could be evaluated: {failed[0].reason}")
+    model = model._replace(id=scores[0].summary["model"])
+    ordered = sorted(scores, key=lambda found: found.name)
+    return EvaluationResult(package_version(), model, jobs[0].configuration(), ordered, sorted(failed))
+
+
+def _jobs(arguments: argparse.Namespace, settings: EvaluationSettings) -> list[EvaluationJob]:
+    from cvcdepth_core.rig import load_rig_layout
+    from cvcdepth_ros.bags.discovery import find_recordings
+
+    locations = find_recordings(arguments.recordings)
+    names = unique_names([(location.name, str(location)) for location in locations])
+    layout = load_rig_layout(arguments.rig) if arguments.rig else None
+    lidar = () if arguments.no_lidar else tuple(arguments.lidar) if arguments.lidar else None
+    job = EvaluationJob("", "", settings, layout, arguments.base_frame, lidar, arguments.start, arguments.duration)
+    return [replace(job, name=name, path=str(path)) for name, path in zip(names, locations, strict=True)]
+
+
+def _model(settings: EvaluationSettings) -> "Model":
+    """Look at the checkpoint before the work begins; CheckpointError says what is wrong with it."""
+    from cvcdepth_core.checkpoint import load_checkpoint
+    from cvcdepth_ros.evaluation.result import Model
+
+    if not settings.checkpoint:
+        return Model("", None, None)
+    path = Path(settings.checkpoint).expanduser()
+    return Model("", str(path), load_checkpoint(path).sha256)
+
+
+def _comparison(first: Path, second: Path) -> tuple[dict[str, Any], str]:
+    from cvcdepth_ros.evaluation.result import StoredResult, comparison_to_json
+
+    content = comparison_to_json(StoredResult.read(first), StoredResult.read(second))
+    return content, _comparison_text(content)
+
+
+def unique_names(candidates: Sequence[tuple[str, str]]) -> list[str]:
+    """Return each candidate's short name, with the long one in its place where several have the same short one."""
+    counts = Counter(short for short, _ in candidates)
+    return [short if counts[short] == 1 else long for short, long in candidates]
+
+
+def _warn_of_damage(job: EvaluationJob, scores: "RecordingScores") -> None:
+    damage, sets = scores.summary["damage"], scores.summary["sets"]["scored"]
+    if damage:
+        seconds = scores.summary["seconds"]
+        warn(f"{job.path}: not everything could be read: {damage}; evaluated {sets} sets of the {seconds:.1f} s there")
+    refusals = scores.summary["truth_refused"]
+    if refusals["count"]:
+        warn(f"{job.path}: {refusals['count']} times no truth, the first: {refusals['reasons'][0]}")
+
+
+@contextmanager
+def _progress(recordings: int, quiet: bool) -> "Iterator[Progress]":
+    """Show on a terminal how many recordings are done; a fraction counts within the one in hand."""
+    from tqdm import tqdm
+
+    form = "{percentage:3.0f}%|{bar}| {n:.1f} of {total} recordings [{elapsed}<{remaining}]"
+    with tqdm(total=recordings, disable=True if quiet else None, bar_format=form) as bar:
+
+        def show(done: float) -> None:
+            bar.update(done - bar.n)
+
+        yield show
+
+
+def _text(result: "EvaluationResult", folder: Path) -> str:
+    from cvcdepth_core.scores import ALL
+
+    summary, scaled = result.summary(), result.summary(scaling="median")
+    header = ("", "abs_rel", "median-scaled", "rmse", "delta_1", "coverage", "truth points")
+    groups = [(group, summary.mean[group], scaled.mean[group]) for group in result.scores.settings.groups]
+    cameras = [(name, found[ALL], scaled.cameras[name][ALL]) for name, found in summary.cameras.items()]
+    lines = [
+        *([table(header, [_row(*row) for row in (*cameras, *groups)])] if result.truth_points else []),
+        *(f"not evaluated: {failure.reason}" for failure in result.failed),
+        f"{len(result.sets)} sets of {len(result.recordings)} recordings, {result.truth_points} truth points",
+        f"{folder}, of {result.model.id}",
+    ]
+    return "\n".join(lines)
+
+
+def _row(name: str, score: "Score", scaled: "Score") -> tuple[str, ...]:
+    numbers = (score.metrics["abs_rel"], scaled.metrics["abs_rel"], score.metrics["rmse"], score.metrics["delta_1"])
+    return (name, *(f"{number:.3f}" for number in (*numbers, score.coverage)), str(score.truth))
+
+
+def _comparison_text(content: dict[str, Any]) -> str:
+    header = ("", "A", "B", "B - A", f"{content['level']:.0%} interval", "")
+    rows = [
+        (f"{name}{' (median-scaled)' if scaling == 'median' else ''}", *_difference_cells(difference))
+        for scaling, differences in content["differences"].items()
+        for name, difference in differences.items()
+    ]
+    return "\n".join(
+        [
+            f"A: {content['first']}",
+            f"B: {content['second']}",
+            table(header, rows),
+            f"{content['sets']} sets in both; only in A {content['only_in_first']}, only in B "
+            f"{content['only_in_second']}; paired bootstrap of {content['resamples']} draws of blocks of "
+            f"{content['block']} sets",
+        ]
+    )
+
+
+def _difference_cells(difference: dict[str, float | None]) -> tuple[str, ...]:
+    first, second, change, low, high = (difference[name] for name in ("first", "second", "difference", "low", "high"))
+    if first is None or second is None or change is None or low is None or high is None:
+        return ("", "", "", "", "not known")
+    verdict = "the same within the interval" if low <= 0 <= high else "different"
+    return (f"{first:.4f}", f"{second:.4f}", f"{change:+.4f}", f"{low:+.4f} to {high:+.4f}", verdict)
+
+
+def _workers(text: str) -> int:
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of at least 1")
+    return int(text)

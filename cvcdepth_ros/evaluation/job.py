@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is to be evaluated, and how: a unit of work that can be sent to another process or machine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+from pydantic import Field, model_validator
+
+from cvcdepth_ros.settings import MatchingSettings, ModelSettings
+
+if TYPE_CHECKING:
+    from cvcdepth_core.estimator import DepthPredictor
+    from cvcdepth_core.ground_truth import OcclusionFilter
+    from cvcdepth_core.rig import Rig, RigLayout
+    from cvcdepth_core.scores import ScoreSettings
+
+
+class EvaluationSettings(MatchingSettings, ModelSettings):
+    """Everything that decides the scores of a given recording, beside the rig and the part that is taken."""
+
+    predictor: Literal["constant", "ground_plane"] | None = None
+    """Score a reference that looks at no picture instead of a network: what any network must beat."""
+    constant_depth: float = Field(10.0, gt=0, le=1e4)
+    """Predictor constant only: metres."""
+    ground_height: float = Field(0.0, ge=-100, le=100)
+    """Predictor ground_plane only: the ground's z in the base frame, metres (-0.4 where that is at a car's axles)."""
+    min_depth: float = Field(0.0, ge=0, le=1e4)
+    """Metres; truth at or below it is left out, predictions are clamped to it."""
+    max_depth: float = Field(80.0, gt=0, le=1e4)
+    """Metres; truth at or beyond it is left out, predictions are clamped to it, and label-free scores stop there."""
+    lidar_tolerance: float = Field(0.1, ge=0, le=10)
+    """Seconds that a LiDAR sweep may be from the image that it is the truth of."""
+    no_occlusion_filter: bool = False
+    """Take every LiDAR point for truth, also those that the camera cannot see behind a nearer surface."""
+    threads: int = Field(1, ge=1, le=1024)
+    """CPU threads of each worker's network. Results are repeatable to the last bit for the same number."""
+
+    @model_validator(mode="after")
+    def _check(self) -> EvaluationSettings:
+        if self.min_depth >= self.max_depth:
+            raise ValueError(f"min-depth {self.min_depth:g} must be below max-depth {self.max_depth:g}")
+        return self
+
+    @property
+    def scores(self) -> ScoreSettings:
+        """What is measured."""
+        from cvcdepth_core.scores import ScoreSettings
+
+        return ScoreSettings(min_depth=self.min_depth, max_depth=self.max_depth)
+
+    @property
+    def occlusion(self) -> OcclusionFilter | None:
+        """Which LiDAR points are no truth."""
+        from cvcdepth_core.ground_truth import OcclusionFilter
+
+        return None if self.no_occlusion_filter else OcclusionFilter()
+
+    def build_predictor(self, rig: Rig) -> DepthPredictor:
+        """Load the network, or make the reference for this rig; the errors of the family say what is wrong."""
+        from cvcdepth_core.reference_predictors import constant_depth, ground_plane_depth
+
+        if self.predictor == "constant":
+            return constant_depth(rig, self.constant_depth, self.height, self.width)
+        if self.predictor == "ground_plane":
+            return ground_plane_depth(rig, self.ground_height, self.max_depth, self.height, self.width)
+        return self.build_estimator()
+
+
+@dataclass(frozen=True)
+class EvaluationJob:
+    """One recording to evaluate."""
+
+    name: str
+    """What results call the recording; unique among those that are evaluated together."""
+    path: str
+    settings: EvaluationSettings
+    layout: RigLayout | None = None
+    """The rig; None: the cameras found in the recording."""
+    base_frame: str = "base_link"
+    """The vehicle's frame, where `layout` is None."""
+    lidar: tuple[str, ...] | None = None
+    """Topics of the LiDARs; none: the vehicle has none; None: all point clouds of the recording."""
+    start: float = 0.0
+    """Seconds of the recording to skip."""
+    duration: float | None = None
+    """Seconds of the recording to take; None: to its end."""
+
+    def configuration(self) -> dict[str, Any]:
+        """Return all that decides the scores, beside the recording and the checkpoint's content, with JSON's types."""
+        return {
+            **self.settings.model_dump(mode="json"),
+            "start": self.start,
+            "duration": self.duration,
+            "lidar": None if self.lidar is None else list(self.lidar),
+            "base_frame": self.layout.base_frame if self.layout else self.base_frame,
+            "rig": self.layout.model_dump(mode="json", exclude_defaults=True) if self.layout else None,
+        }

@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The result of an evaluation: the recordings' scores merged, as `metrics.json` holds them (docs/evaluation.md)."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from cvcdepth_core.comparison import Comparison, compare
+from cvcdepth_core.consistency import AgreementRow, summarise_agreement
+from cvcdepth_core.errors import ConfigError
+from cvcdepth_core.scores import SCALINGS, Scaling, Scores, Summary, sorted_rows
+from cvcdepth_core.scores import Protocol as ScoreProtocol
+from cvcdepth_ros.evaluation.frames import ImageScore, SetScore, correlations, image_scores, set_scores
+from cvcdepth_ros.evaluation.recording import RecordingScores
+
+SCHEMA = 1
+PROTOCOLS: tuple[ScoreProtocol, ...] = ("image", "pool")
+
+
+class Failure(NamedTuple):
+    """A recording that could not be evaluated."""
+
+    name: str
+    path: str
+    reason: str
+
+
+class Model(NamedTuple):
+    """What was evaluated."""
+
+    id: str
+    """What reports call it."""
+    checkpoint: str | None
+    """The checkpoint's path; None for an untrained network or a reference."""
+    sha256: str | None
+    """Hash of the checkpoint's bytes."""
+
+
+@dataclass(frozen=True)
+class EvaluationResult:
+    """One model on all recordings."""
+
+    version: str
+    model: Model
+    configuration: Mapping[str, Any]
+    recordings: Sequence[RecordingScores]
+    """Sorted by name, so that nothing depends on the order in which they were finished."""
+    failed: Sequence[Failure]
+
+    @cached_property
+    def scores(self) -> Scores:
+        """The rows of all recordings."""
+        return Scores.merged(recording.scores for recording in self.recordings)
+
+    @cached_property
+    def agreement(self) -> tuple[AgreementRow, ...]:
+        """The label-free comparisons of all recordings."""
+        return sorted_rows(row for recording in self.recordings for row in recording.agreement)
+
+    @cached_property
+    def images(self) -> list[ImageScore]:
+        """All scores, image by image."""
+        return image_scores(self.scores, self.agreement)
+
+    @cached_property
+    def sets(self) -> list[SetScore]:
+        """All scores, set by set."""
+        return set_scores(self.images)
+
+    def summary(self, protocol: ScoreProtocol = "image", scaling: Scaling = "metric") -> Summary:
+        """Take the means over all recordings."""
+        return self.scores.summary(protocol, scaling)
+
+    @property
+    def truth_points(self) -> int:
+        """Pixels with truth, inside the depth limits."""
+        return sum(int(recording.summary["truth_points"]) for recording in self.recordings)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the content of `metrics.json`."""
+        return {
+            "schema": SCHEMA,
+            "version": self.version,
+            "model": self.model._asdict(),
+            "configuration": dict(self.configuration),
+            "sets": len(self.sets),
+            "truth_points": self.truth_points,
+            "scores": {p: {s: self.summary(p, s).to_json() for s in SCALINGS} for p in PROTOCOLS},
+            "label_free": self._label_free(),
+            "recordings": [recording.summary for recording in self.recordings],
+            "failed": [failure._asdict() for failure in self.failed],
+            "rows": self.scores.to_json(),
+        }
+
+    def _label_free(self) -> dict[str, Any]:
+        pairs = [
+            {"kind": kind, "camera": camera, "other": other} | _without_nan(found._asdict())
+            for (kind, camera, other), found in summarise_agreement(self.agreement).items()
+        ]
+        return {"pairs": pairs, "rank_correlation_with_abs_rel": _without_nan(correlations(self.sets))}
+
+
+@dataclass(frozen=True)
+class StoredResult:
+    """What a comparison needs of a `metrics.json`."""
+
+    model_id: str
+    scores: Scores
+
+    @classmethod
+    def read(cls, path: Path) -> StoredResult:
+        """Read a `metrics.json`; ConfigError when the file is no such thing."""
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            schema, model_id, rows = content["schema"], content["model"]["id"], content["rows"]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ConfigError(f"{path}: not a metrics.json of evaluate: {error!r}") from error
+        if schema != SCHEMA:
+            raise ConfigError(f"{path}: schema is {schema}, expected {SCHEMA}")
+        return cls(str(model_id), Scores.from_json(rows))
+
+
+def comparison_to_json(first: StoredResult, second: StoredResult) -> dict[str, Any]:
+    """Compare two results over the sets that both have, depth as predicted and median-scaled."""
+    found = {scaling: compare(first.scores, second.scores, scaling=scaling) for scaling in SCALINGS}
+    return {
+        "schema": SCHEMA,
+        "first": first.model_id,
+        "second": second.model_id,
+        **_without_differences(found["metric"]),
+        "differences": {scaling: _differences(comparison) for scaling, comparison in found.items()},
+    }
+
+
+def _without_differences(comparison: Comparison) -> dict[str, Any]:
+    return {name: value for name, value in asdict(comparison).items() if name != "differences"}
+
+
+def _differences(comparison: Comparison) -> dict[str, Any]:
+    return {name: _without_nan(asdict(difference)) for name, difference in comparison.differences.items()}
+
+
+def _without_nan(numbers: Mapping[str, float]) -> dict[str, float | None]:
+    return {name: None if math.isnan(number) else number for name, number in numbers.items()}
