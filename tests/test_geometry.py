@@ -10,6 +10,7 @@ from torch import Tensor
 
 from cvcdepth_core.augmentation import mirror_motion
 from cvcdepth_core.geometry import (
+    PROJECTION_EPSILON,
     axis_angle_to_rotation,
     back_project,
     project,
@@ -25,7 +26,7 @@ from cvcdepth_core.pose_distribution import (
     motions_seen_from_anchor,
     relative_poses,
 )
-from cvcdepth_core.view_synthesis import align_intensity, splat_depth, warp_views
+from cvcdepth_core.view_synthesis import align_intensity, sample, splat_depth, warp_views
 
 FLOAT64 = torch.float64
 EYE = torch.eye(4, dtype=FLOAT64)
@@ -141,6 +142,22 @@ def test_an_unmoved_camera_renders_its_own_image():
     inside = (slice(None), slice(None), slice(1, -1), slice(1, -1))  # 1e-7 in the projection may push the border out
     torch.testing.assert_close(warp.images[inside], images[inside], rtol=1e-5, atol=1e-5)
     assert warp.masks[inside].all()
+
+
+def test_a_point_in_the_focal_plane_projects_to_finite_pixels_with_finite_gradients():
+    points = torch.tensor([[1.0, 0.0], [2.0, 0.0], [-PROJECTION_EPSILON] * 2]).requires_grad_()
+    pixels, _ = project(points, torch.eye(3))
+    assert pixels.isfinite().all()
+    (0.0 * pixels).sum().backward()
+    assert points.grad.isfinite().all()
+
+
+def test_sampling_infinitely_far_outside_gives_black_with_zero_gradient():
+    grid = torch.tensor([[torch.inf, 0.0], [-torch.inf, 3e38]]).view(1, 1, 2, 2).requires_grad_()
+    sampled = sample(torch.ones(1, 3, 6, 7), grid)
+    assert not sampled.nan_to_num(1).any()
+    sampled.sum().backward()
+    assert not grid.grad.nan_to_num(1).any()
 
 
 def test_points_behind_the_camera_are_seen_only_by_the_published_validity():
