@@ -18,10 +18,12 @@ import pytest
 
 pytest.importorskip("rclpy", reason="these tests need a ROS environment")
 
+from cvcdepth_core.errors import ConfigError
 from cvcdepth_core.rig import RigLayout
 from cvcdepth_ros.bags import RecordingWriter, open_recording
 from cvcdepth_ros.demo.node_report import Latency, NodeReport, read_report
 from cvcdepth_ros.demo.page import animation_page
+from cvcdepth_ros.demo.paths import DemoPaths
 from cvcdepth_ros.demo.processes import Child, Children, DemoError, free_domain
 from cvcdepth_ros.demo.received import Output, ReceivedSets, SentSet, node_outputs, sent_sets
 from cvcdepth_ros.demo.recorded_lidar import RecordedLidar
@@ -253,6 +255,24 @@ def test_the_domain_of_the_user_is_taken(tmp_path: Path, monkeypatch: pytest.Mon
     assert 1 <= int(Children(tmp_path).domain) <= 101
 
 
+def test_what_the_demo_did_not_write_is_not_removed(tmp_path: Path):
+    (tmp_path / "recording").mkdir()
+    (tmp_path / "recording" / "drive.mcap").touch()
+    with pytest.raises(ConfigError, match=r"recording was not written by the demo"):
+        DemoPaths(tmp_path).prepare()
+    assert (tmp_path / "recording" / "drive.mcap").exists()
+
+
+def test_what_an_earlier_run_wrote_is_removed_and_the_rest_is_kept(tmp_path: Path):
+    paths = DemoPaths(tmp_path)
+    paths.prepare()
+    for file in (paths.result, paths.sheets / "set_001.png", tmp_path / "notes.txt"):
+        file.touch()
+    paths.prepare()
+    assert {path.name for path in tmp_path.iterdir()} == {"sets", "logs", "notes.txt", ".cvcdepth_demo"}
+    assert not list(paths.sheets.iterdir())
+
+
 # The recorder
 
 
@@ -468,7 +488,13 @@ def test_what_makes_the_node_useless_is_its_error():
 
 def result_of(sent: int, matched: int, published: int, received: int) -> DemoResult:
     node = NodeReport(sets={"matched": matched, "published": published, "replaced": matched - published})
-    nothing: dict[str, Any] = {"incomplete": {}, "messages_received": {}, "messages_lost": {}, "parameters": {}}
+    nothing: dict[str, Any] = {
+        "incomplete": {},
+        "never_sent": {},
+        "messages_received": {},
+        "messages_lost": {},
+        "parameters": {},
+    }
     counts = {"sent": sent, "received": received, "images_sent": 6 * sent}
     return DemoResult(version="0", recording="bag", rate=1, untrained=True, node=node, **counts, **nothing)
 

@@ -105,11 +105,6 @@ class Setup:
         outputs = node_outputs(NODE, layout.names, layout.anchor_camera)
         return cls(recording, layout, model, parameters, outputs)
 
-    @property
-    def untrained(self) -> bool:
-        """Whether the network has random weights."""
-        return self.model.untrained
-
     def write_parameters(self, paths: DemoPaths) -> None:
         """Write the node's parameter file."""
         content = {NODE.lstrip("/"): {"ros__parameters": self.parameters}}
@@ -143,7 +138,7 @@ def _show(setup: Setup, paths: DemoPaths, outcome: LiveOutcome) -> DemoResult:
         sets = sent_sets(recording, setup.layout, _TOLERANCE_SECONDS, outcome.sent)
         received = ReceivedSets(paths.recording, setup.outputs, sets)
         lidar = RecordedLidar(recording, setup.layout)
-        writer = SheetWriter(setup.layout.complete(), lidar, paths.sheets, setup.notes(outcome), setup.untrained)
+        writer = SheetWriter(setup.layout.complete(), lidar, paths.sheets, setup.notes(outcome), setup.model.untrained)
         for _ in tqdm(writer.write(received, len(sets)), desc="drawing", total=outcome.node.published, disable=None):
             pass
     result = DemoResult(
@@ -151,9 +146,10 @@ def _show(setup: Setup, paths: DemoPaths, outcome: LiveOutcome) -> DemoResult:
         recording=str(setup.recording),
         rate=outcome.rate,
         parameters=setup.parameters,
-        untrained=setup.untrained,
+        untrained=setup.model.untrained,
         sent=len(sets),
         received=len(writer.jpegs),
+        never_sent=dict(received.foreign),
         incomplete={sequence + 1: topics for sequence, topics in received.missing.items()},
         node=outcome.node,
         images_sent=sum(outcome.sent.get(camera.image_topic, 0) for camera in setup.layout.cameras),

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How fast a recording may be played so that this machine manages every set."""
 
+import os
 import time
 
 import numpy as np
@@ -9,7 +10,7 @@ import torch
 from cvcdepth_core.estimator import DepthEstimator
 from cvcdepth_core.rig import RigLayout
 from cvcdepth_ros.bags import Recording
-from cvcdepth_ros.demo.processes import inference_threads
+from cvcdepth_ros.demo.processes import THREADS_VARIABLE, spared_threads
 from cvcdepth_ros.settings import ModelSettings
 from cvcdepth_ros.synchronizer import NANOSECONDS
 
@@ -33,7 +34,8 @@ def _inference_seconds(estimator: DepthEstimator, cameras: int) -> float:
     """Time the estimator on one set of grey pictures; a first run, which sets things up, does not count."""
     pictures = [np.full((estimator.spec.height, estimator.spec.width, 3), 127, dtype=np.uint8)] * cameras
     focal_lengths = np.full(cameras, float(estimator.spec.width))
-    torch.set_num_threads(inference_threads())
+    if THREADS_VARIABLE not in os.environ:
+        torch.set_num_threads(spared_threads())
     estimator.estimate(pictures, focal_lengths)
     began = time.monotonic()
     estimator.estimate(pictures, focal_lengths)

@@ -20,6 +20,8 @@ from typing import IO, Any
 
 from cvcdepth_core.errors import CvcDepthError
 
+THREADS_VARIABLE = "OMP_NUM_THREADS"
+
 _LAST_LINES = 5
 _STOP_SECONDS = 15.0
 _LAST_DOMAIN = 101  # beyond it, DDS ports run into Linux's ephemeral ones
@@ -117,11 +119,12 @@ class Children:
         self._logs = logs
         self._children: list[Child] = []
         self.domain = os.environ.get("ROS_DOMAIN_ID") or str(free_domain())
-        self._environment = os.environ | {
+        self._environment = {
+            THREADS_VARIABLE: str(spared_threads()),
+            **os.environ,
             "ROS_DOMAIN_ID": self.domain,
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
             "PYTHONUNBUFFERED": "1",
-            "OMP_NUM_THREADS": str(inference_threads()),
         }
 
     def start(self, name: str, *arguments: str) -> Child:
@@ -159,13 +162,13 @@ def wait_until(what: str, condition: Callable[[], bool], seconds: float) -> None
             raise DemoError(f"waited {seconds:.0f} s in vain {what}")
 
 
-def inference_threads() -> int:
-    """Return how many threads the node gets: the user's OMP_NUM_THREADS, else all processors but one.
+def spared_threads() -> int:
+    """Return how many threads inference gets where the user does not say: all processors but one.
 
     That one is for the player and the recorder. As many threads as processors wait for each other whenever one of them
-    is taken away: on two busy processors two threads were found to need three times as long as one.
+    is taken away: on two busy processors two threads were found to need up to four times as long as one.
     """
-    return int(os.environ.get("OMP_NUM_THREADS") or max(len(os.sched_getaffinity(0)) - 1, 1))
+    return max(len(os.sched_getaffinity(0)) - 1, 1)
 
 
 def free_domain() -> int:

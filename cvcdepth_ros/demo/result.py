@@ -21,7 +21,7 @@ class DemoResult(BaseModel):
     recording: str
     """What was played."""
     rate: float
-    """Seconds of the recording per second."""
+    """How many times real time it was played."""
     parameters: dict[str, Any]
     """The node's parameters."""
     untrained: bool
@@ -32,6 +32,8 @@ class DemoResult(BaseModel):
     """Sets of which every message arrived at the recorder, with exactly the stamps that were sent."""
     incomplete: dict[int, list[str]]
     """Sets (counted from 1) of which only a part arrived: the topics without a message."""
+    never_sent: dict[str, int]
+    """By topic: messages that arrived with the stamp of no set that was sent."""
     node: NodeReport
     """The node's last diagnostics."""
     images_sent: int
@@ -49,13 +51,14 @@ class DemoResult(BaseModel):
             f"{self.sent} sets were sent complete, but {node.matched} matched": node.matched == self.sent,
             f"no set was published: {node.error or node.set_error or self._dropped()}": node.published > 0,
             f"{node.published} sets were published, but {self.received} received": self.received == node.published,
+            f"messages came with stamps of no set that was sent: {_listed(self.never_sent)}": not self.never_sent,
         }
         return [problem for problem, passed in checks.items() if not passed]
 
     def counts(self) -> list[tuple[str, str]]:
         """Lay out what became of sets and images, a name and a value each."""
         return [
-            ("played at times real time", f"{self.rate:.3g}"),
+            ("speed, 1 is real time", f"{self.rate:.3g}"),
             ("sets sent complete", str(self.sent)),
             ("sets matched", str(self.node.matched)),
             ("sets published", str(self.node.published)),
