@@ -12,7 +12,6 @@ from collections import Counter
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import IO, NamedTuple
 
 from mcap.data_stream import ReadDataStream
@@ -25,6 +24,7 @@ from mcap.summary import Summary
 from zstandard import ZstdError
 
 from cvcdepth_ros.bags.ordering import Source, in_time_order
+from cvcdepth_ros.bags.remote import Location
 from cvcdepth_ros.bags.topics import RecordedMessage, RecordingFile, Topic, joined_topics, recorded_qos
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -53,11 +53,13 @@ class _Index:
 class McapFile(RecordingFile):
     """One .mcap file, see `RecordingFile`."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Location) -> None:
         super().__init__(path)
         with path.open("rb") as stream:
-            self._size = stream.seek(0, io.SEEK_END)
-            self._index = self._indexed(stream) or self._scanned(stream)
+            self.size = stream.seek(0, io.SEEK_END)
+            index = self._indexed(stream)
+            self.indexed = index is not None
+            self._index = index or self._scanned(stream)
         self.start = min((block.start for block in self._index.blocks), default=None)
         self.end = max((block.end for block in self._index.blocks), default=None)
         self.topics = joined_topics([*self._channel_topics()], path)
@@ -87,7 +89,7 @@ class McapFile(RecordingFile):
 
     def _indexed(self, stream: IO[bytes]) -> _Index | None:
         """Read the index at the end of the file; None when there is none or it does not cover all messages."""
-        stream.seek(max(0, self._size - len(MAGIC)))
+        stream.seek(max(0, self.size - len(MAGIC)))
         if stream.read() != MAGIC:
             return None
         stream.seek(0)
@@ -110,7 +112,7 @@ class McapFile(RecordingFile):
             offset += _RECORD_HEADER.size + header[1]
         if header is None:
             self._report(
-                f"cut or unreadable from byte {offset} of {self._size} on, no index: "
+                f"cut or unreadable from byte {offset} of {self.size} on, no index: "
                 f"{index.counts.total()} messages of the {len(index.blocks)} chunks before it recovered"
             )
         return index
@@ -123,7 +125,7 @@ class McapFile(RecordingFile):
             return None
         opcode, length = _RECORD_HEADER.unpack(header)
         # An opcode of 0 is not in use: it is what a preallocated, never written block reads as.
-        return (opcode, length) if opcode and offset + _RECORD_HEADER.size + length <= self._size else None
+        return (opcode, length) if opcode and offset + _RECORD_HEADER.size + length <= self.size else None
 
     def _intact_records(self, stream: IO[bytes], offset: int) -> list[McapRecord]:
         """Return what is in the record at `offset`, nothing when it is damaged (which is reported)."""

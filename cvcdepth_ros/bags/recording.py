@@ -17,38 +17,38 @@ from cvcdepth_core.errors import RecordingError
 from cvcdepth_ros.bags import mcap_file, ros1_file, sqlite_file
 from cvcdepth_ros.bags.mcap_file import McapFile
 from cvcdepth_ros.bags.ordering import Source, in_time_order
+from cvcdepth_ros.bags.remote import Location, RemotePath, location
 from cvcdepth_ros.bags.ros1_file import Ros1File
 from cvcdepth_ros.bags.sqlite_file import SqliteFile
-from cvcdepth_ros.bags.topics import RecordedMessage, RecordingFile, Topic, joined_topics
+from cvcdepth_ros.bags.topics import STORAGE_SUFFIXES, RecordedMessage, RecordingFile, Topic, joined_topics
 from cvcdepth_ros.bags.typestores import typestore_for
 
-_READERS: dict[bytes, Callable[[Path], RecordingFile]] = {
-    mcap_file.MAGIC: McapFile,
+_LOCAL_READERS: dict[bytes, Callable[[Path], RecordingFile]] = {
     sqlite_file.MAGIC: SqliteFile,
     ros1_file.MAGIC: Ros1File,
 }
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-_SUFFIXES = (".mcap", ".db3", ".bag", ".mcap.zstd", ".db3.zstd")
 _FOREVER = 2**63 - 1
 _SHOWN_DAMAGES = 5
 
-RecordingPath = str | Path
+RecordingPath = str | Location
 
 
 def open_recording(path: RecordingPath | Sequence[RecordingPath]) -> "Recording":
     """Open a rosbag2 folder, a single .mcap, .db3 or ROS 1 .bag file, or several that together are one recording.
 
-    Damaged parts are passed over and told in `Recording.damage`. Raises RecordingError, naming the path and what was
-    found there, when no message can be read.
+    Behind a URL that fsspec opens (s3://bucket/drive.mcap) only MCAP is read, by seeking. Damaged parts are passed over
+    and told in `Recording.damage`. Raises RecordingError, naming the path and what was found there, when no message can
+    be read, and ConfigError when a URL needs a package that is not installed.
     """
-    paths = [Path(path)] if isinstance(path, str | Path) else [Path(part) for part in path]
-    return Recording(paths)
+    parts = [path] if isinstance(path, str | Path | RemotePath) else path
+    return Recording([location(part) for part in parts])
 
 
 class Recording:
     """Topics and messages of one recording; use it as a context manager."""
 
-    path: Path
+    path: Location
     """What was opened (the first path when several were)."""
     topics: dict[str, Topic]
     """By name, in the order of the recording."""
@@ -57,7 +57,7 @@ class Recording:
     end: int
     """Log time of the last message, ns."""
 
-    def __init__(self, paths: Sequence[Path]) -> None:
+    def __init__(self, paths: Sequence[Location]) -> None:
         if not paths:
             raise RecordingError("no recording given: the list of paths is empty")
         self.path = paths[0]
@@ -67,6 +67,9 @@ class Recording:
             self._files = self._open_files([file for path in paths for file in self._listed(path)])
             self.topics = joined_topics([t for file in self._files for t in file.topics.values()], self.path)
             self.start, self.end = self._span()
+        except OSError as error:
+            self.close()
+            raise RecordingError(f"{self.path}: {error.strerror or error}") from error
         except BaseException:
             self.close()
             raise
@@ -90,6 +93,11 @@ class Recording:
         if len(found) > _SHOWN_DAMAGES:
             found[_SHOWN_DAMAGES:] = [f"and {len(found) - _SHOWN_DAMAGES} more"]
         return "; ".join(found) or None
+
+    @property
+    def files(self) -> Sequence[RecordingFile]:
+        """The files it is stored in."""
+        return tuple(self._files)
 
     @cached_property
     def typestore(self) -> Typestore:
@@ -158,13 +166,13 @@ class Recording:
             raise RecordingError(f"{self.path}: holds no readable message{damage}")
         return min(starts), max(ends)
 
-    def _listed(self, path: Path) -> list[Path]:
+    def _listed(self, path: Location) -> list[Location]:
         """Return the storage files of a path: itself, or those of a folder."""
         if not path.exists():
             raise RecordingError(f"{path}: does not exist")
         if path.is_file():
             return [path]
-        present = sorted(file for file in path.iterdir() if file.name.endswith(_SUFFIXES))
+        present = sorted(file for file in path.iterdir() if file.name.endswith(STORAGE_SUFFIXES))
         files = self._listed_by_metadata(path) or present
         if missing := [file.name for file in files if not file.exists()]:
             self._damage.append(f"{path}: metadata.yaml lists {', '.join(missing)}, not found")
@@ -173,7 +181,7 @@ class Recording:
             raise RecordingError(f"{path}: no recording in this folder; found {content}")
         return files
 
-    def _listed_by_metadata(self, folder: Path) -> list[Path]:
+    def _listed_by_metadata(self, folder: Location) -> list[Location]:
         """Return what metadata.yaml lists, nothing when the recorder died before it wrote one."""
         metadata = folder / "metadata.yaml"
         if not metadata.exists():
@@ -186,7 +194,7 @@ class Recording:
             self._damage.append(f"{metadata}: unreadable ({type(error).__name__}), reading all files of the folder")
             return []
 
-    def _open_files(self, paths: Sequence[Path]) -> list[RecordingFile]:
+    def _open_files(self, paths: Sequence[Location]) -> list[RecordingFile]:
         """Open the files; when one of several cannot be opened, the others are still read."""
         files: list[RecordingFile] = []
         errors: list[RecordingError] = []
@@ -200,19 +208,22 @@ class Recording:
         self._damage += map(str, errors)
         return files
 
-    def _open_file(self, path: Path) -> RecordingFile:
+    def _open_file(self, path: Location) -> RecordingFile:
         try:
             with path.open("rb") as stream:
                 beginning = stream.read(16)
+            if beginning.startswith(mcap_file.MAGIC):
+                return McapFile(path)
+            if isinstance(path, RemotePath):
+                raise RecordingError(f"{path}: {_begins(beginning)}; behind a URL only MCAP can be read, by seeking")
             if beginning.startswith(_ZSTD_MAGIC):
                 return self._open_file(self._unpack(path))
-            for magic, reader in _READERS.items():
+            for magic, reader in _LOCAL_READERS.items():
                 if beginning.startswith(magic):
                     return reader(path)
         except OSError as error:
             raise RecordingError(f"{path}: {error.strerror or error}") from error
-        found = f"begins with {beginning!r}" if beginning else "is empty (0 bytes)"
-        raise RecordingError(f"{path}: {found}; an MCAP, SQLite or ROS 1 recording was expected")
+        raise RecordingError(f"{path}: {_begins(beginning)}; an MCAP, SQLite or ROS 1 recording was expected")
 
     def _unpack(self, path: Path) -> Path:
         """Unpack a file that was compressed as a whole into a temporary folder."""
@@ -224,3 +235,7 @@ class Recording:
         except zstandard.ZstdError as error:
             raise RecordingError(f"{path}: cannot be decompressed: {error}") from error
         return target
+
+
+def _begins(beginning: bytes) -> str:
+    return f"begins with {beginning!r}" if beginning else "is empty (0 bytes)"

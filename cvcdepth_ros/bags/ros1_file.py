@@ -24,8 +24,11 @@ _ROS2_TYPES = ("std_msgs/msg/Header", "builtin_interfaces/msg/Time", "builtin_in
 class Ros1File(RecordingFile):
     """One .bag file, see `RecordingFile`."""
 
+    path: Path
+
     def __init__(self, path: Path) -> None:
         super().__init__(path)
+        self.size = path.stat().st_size
         try:
             with Reader(path) as reader:
                 self.topics = joined_topics([_topic(connection) for connection in reader.connections], path)

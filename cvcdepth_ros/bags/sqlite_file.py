@@ -16,8 +16,11 @@ MAGIC = b"SQLite format 3\0"
 class SqliteFile(RecordingFile):
     """One .db3 file, see `RecordingFile`."""
 
+    path: Path
+
     def __init__(self, path: Path) -> None:
         super().__init__(path)
+        self.size = path.stat().st_size
         try:
             with closing(self._connect()) as database:
                 self._names = self._readable_names(database)

@@ -4,7 +4,6 @@
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import NamedTuple
 
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
@@ -12,6 +11,10 @@ from rosbags.rosbag2 import ReaderError
 from rosbags.rosbag2.metadata import parse_qos
 
 from cvcdepth_core.errors import RecordingError
+from cvcdepth_ros.bags.remote import Location
+
+STORAGE_SUFFIXES = (".mcap", ".db3", ".bag", ".mcap.zstd", ".db3.zstd")
+"""How the names of storage files end; a file that is named itself may end otherwise."""
 
 
 class RecordedMessage(NamedTuple):
@@ -38,7 +41,7 @@ class Topic:
     definition: str | None = None
     """The message definition (.msg or IDL text, with those it refers to), or None where the recording has none."""
 
-    def joined(self, other: "Topic", where: Path) -> "Topic":
+    def joined(self, other: "Topic", where: Location) -> "Topic":
         """Return this topic with the messages of another channel or file of the same recording added.
 
         Raises RecordingError, naming `where`, when the two have different message types.
@@ -62,8 +65,12 @@ class RecordingFile(ABC):
     """Log time of the first message, ns; None when the file holds no message."""
     end: int | None
     """Log time of the last message, ns."""
+    size: int
+    """Bytes."""
+    indexed: bool = True
+    """Whether the file told where its messages are; else it was read through once to find them."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Location) -> None:
         self.path = path
         self.damage: list[str] = []
         """What could not be read; grows while messages are read."""
@@ -85,7 +92,7 @@ def error_text(error: BaseException) -> str:
     return str(error) or type(error).__name__
 
 
-def joined_topics(topics: Collection[Topic], where: Path) -> dict[str, Topic]:
+def joined_topics(topics: Collection[Topic], where: Location) -> dict[str, Topic]:
     """Return the topics by name, those that appear more than once joined into one."""
     by_name: dict[str, Topic] = {}
     for topic in topics:
