@@ -14,8 +14,6 @@ from cvcdepth_core.rig import Rig
 from cvcdepth_ros.messages import ros_message_class, ros_message_factory
 from cvcdepth_ros.surround_messages import SurroundMessages, output_types
 
-_OUTPUT_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10, reliability=ReliabilityPolicy.RELIABLE)
-
 
 class SurroundOutputs:
     """Publishes one set's depth, pictures and clouds under the node's private names."""
@@ -53,6 +51,7 @@ class SurroundOutputs:
         return self._node.create_publisher(
             ros_message_class(type_name),
             f"~/{topic}",
-            _OUTPUT_QOS,
+            # Overrides are written into the profile that is handed over: each publisher needs its own.
+            QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10, reliability=ReliabilityPolicy.RELIABLE),
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )

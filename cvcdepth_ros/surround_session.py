@@ -119,15 +119,18 @@ class SurroundSession:
             self._rebuild()
 
     def _rebuild(self) -> None:
-        """Build the rectification maps anew, or forget them while the rig is not complete."""
-        self._surround = None
-        if self._assembler.problems():
-            return
-        try:
-            self._surround = SurroundDepthEstimator(self._assembler.rig(), self._estimator)
-            self._rig_problem = ""
-        except CvcDepthError as error:
-            self._rig_problem = str(error)
+        """Build the rectification maps anew, or forget them while the rig is not complete.
+
+        The worker keeps using the former maps until the new ones are there.
+        """
+        surround = None
+        self._rig_problem = ""
+        if not self._assembler.problems():
+            try:
+                surround = SurroundDepthEstimator(self._assembler.rig(), self._estimator)
+            except CvcDepthError as error:
+                self._rig_problem = str(error)
+        self._surround = surround
 
     def _work(self) -> None:
         while not self._mailbox.closed:

@@ -18,6 +18,7 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
+from rclpy.qos import ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
@@ -304,8 +305,15 @@ def test_qos_overrides_make_a_single_topic_match(graph, messages, rig_content, t
         for name in CAMERAS
         for topic in ("camera_info", "image_raw/compressed")
     }
-    start_and_connect(graph, write_rig(tmp_path, rig_content), feed, reliable=True, **overrides)
+    output = {"qos_overrides./surround_depth/left/points.publisher.reliability": "best_effort"}
+    start_and_connect(graph, write_rig(tmp_path, rig_content), feed, reliable=True, **overrides, **output)
     feed.publish_until(lambda: graph.received["/surround_depth/front/depth/image_rect"], "depth")
+
+    def reliability(topic: str) -> Any:
+        return graph.node.get_publishers_info_by_topic(topic)[0].qos_profile.reliability
+
+    assert reliability("/surround_depth/left/points") == ReliabilityPolicy.BEST_EFFORT
+    assert reliability("/surround_depth/back/points") == ReliabilityPolicy.RELIABLE
 
 
 @pytest.mark.parametrize(
