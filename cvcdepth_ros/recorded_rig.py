@@ -24,14 +24,26 @@ def discover_rig(recording: Recording, base_frame: str = "base_link") -> RigLayo
     Raises RecordingError when there are fewer than two, and RigError or TransformError, naming the recording and the
     camera, for the first that is not calibrated or has no transform to `base_frame`.
     """
+    return assemble_rig(recording, discover_layout(recording, base_frame)).completed_layout()
+
+
+def discover_layout(recording: Recording, base_frame: str = "base_link") -> RigLayout:
+    """Find the recording's cameras; calibrations and poses are still open.
+
+    Raises RecordingError when there are fewer than two.
+    """
+    entries = recorded_cameras(recording)
+    if len(entries) < 2:
+        raise RecordingError(f"{recording.path}: {_too_few(entries, recording)}")
     try:
-        entries = discover_cameras({topic.name: topic.type for topic in recording.topics.values() if topic.count})
-        if len(entries) < 2:
-            raise RecordingError(f"{recording.path}: {_too_few(entries, recording)}")
-        layout = RigLayout(base_frame=base_frame, cameras=tuple(entries))
+        return RigLayout(base_frame=base_frame, cameras=tuple(entries))
     except ValidationError as error:
         raise RecordingError(f"{recording.path}: its cameras make no rig: {first_validation_message(error)}") from error
-    return assemble_rig(recording, layout).completed_layout()
+
+
+def recorded_cameras(recording: Recording) -> list[CameraEntry]:
+    """Return the cameras of which something was recorded, see `discover_cameras`."""
+    return discover_cameras({topic.name: topic.type for topic in recording.topics.values() if topic.count})
 
 
 def assemble_rig(recording: Recording, layout: RigLayout) -> RigAssembler:
@@ -40,13 +52,22 @@ def assemble_rig(recording: Recording, layout: RigLayout) -> RigAssembler:
     Raises RecordingError when a topic that the layout needs is not in the recording or is of another type; RigError or
     TransformError, naming the recording and the camera, for the first that stays incomplete.
     """
-    for problem in _topic_problems(recording, layout):
+    for problem in topic_problems(recording, layout):
         raise RecordingError(f"{recording.path}: {problem}")
+    assembler = collect_rig(recording, layout)
+    for problem in assembler.problems().values():
+        raise RigError(f"{recording.path}: {problem}")
+    return assembler
+
+
+def collect_rig(recording: Recording, layout: RigLayout) -> RigAssembler:
+    """Collect each camera's first CameraInfo and the static transforms, as far as they are recorded.
+
+    Raises TransformError for transforms that contradict each other.
+    """
     assembler = RigAssembler(layout)
     _add_first_camera_infos(assembler, recording)
     _add_static_transforms(assembler, recording)
-    for problem in assembler.problems().values():
-        raise RigError(f"{recording.path}: {problem}")
     return assembler
 
 
@@ -76,7 +97,7 @@ def _add_static_transforms(assembler: RigAssembler, recording: Recording) -> Non
             raise TransformError(f"{recording.path}: {STATIC_TRANSFORMS}: {error}") from error
 
 
-def _topic_problems(recording: Recording, layout: RigLayout) -> Iterator[str]:
+def topic_problems(recording: Recording, layout: RigLayout) -> Iterator[str]:
     """Say what is wrong with the topics that the cameras need, camera by camera."""
     for camera in layout.cameras:
         problem = _topic_problem(recording, camera.image_topic, _IMAGE_TYPES)

@@ -48,8 +48,31 @@ class RigAssembler:
 
     def problems(self) -> dict[str, str]:
         """Say for each camera that is not complete what it lacks; empty when the rig can be built."""
-        found = ((camera.name, self._problem(camera)) for camera in self.layout.cameras)
+        found = ((name, self._problem(name)) for name in self.layout.names)
         return {name: problem for name, problem in found if problem is not None}
+
+    def calibration(self, camera: str) -> Calibration | None:
+        """Return the camera's calibration: the rig file's, else CameraInfo's, None while neither is known."""
+        return self._entry(camera).calibration or self._calibrations.get(camera)
+
+    def calibration_problem(self, camera: str) -> str | None:
+        """Say why the camera has no calibration; None when it has one."""
+        if self.calibration(camera) is not None:
+            return None
+        waiting = f"camera {camera}: waiting for camera_info on {self._entry(camera).camera_info_topic}"
+        return self._refused.get(camera, waiting)
+
+    def transform_problem(self, camera: str) -> str | None:
+        """Say why the camera's pose in the base frame is not known; None when it is."""
+        entry = self._entry(camera)
+        if self.frame_id(camera) is None:
+            return f"camera {camera}: no frame_id in the rig file, waiting for {entry.camera_info_topic}"
+        if entry.base_T_camera is None:
+            try:
+                self._lookup(entry)
+            except TransformError as error:
+                return f"camera {camera}: {error}"
+        return None
 
     def rig(self) -> Rig:
         """Build the rig. RigError or TransformError names the first camera that lacks something."""
@@ -81,16 +104,5 @@ class RigAssembler:
     def _lookup(self, entry: CameraEntry) -> Any:
         return self.transforms.lookup(self.layout.base_frame, self.frame_id(entry.name) or "")
 
-    def _problem(self, entry: CameraEntry) -> str | None:
-        if entry.name in self._refused and entry.calibration is None:
-            return self._refused[entry.name]
-        if entry.calibration is None and entry.name not in self._calibrations:
-            return f"camera {entry.name}: waiting for camera_info on {entry.camera_info_topic}"
-        if self.frame_id(entry.name) is None:
-            return f"camera {entry.name}: no frame_id in the rig file, waiting for {entry.camera_info_topic}"
-        if entry.base_T_camera is None:
-            try:
-                self._lookup(entry)
-            except TransformError as error:
-                return f"camera {entry.name}: {error}"
-        return None
+    def _problem(self, camera: str) -> str | None:
+        return self.calibration_problem(camera) or self.transform_problem(camera)

@@ -5,13 +5,17 @@ import argparse
 import json
 import math
 import sys
-from collections.abc import Sequence
-from typing import Any, Literal, TypeVar, get_args, get_origin
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin
 
 from pydantic import ValidationError
 
 from cvcdepth_core.calibration import first_validation_message
 from cvcdepth_ros.settings import ModelSettings
+
+if TYPE_CHECKING:
+    from cvcdepth_ros.bags import Recording
 
 SettingsT = TypeVar("SettingsT", bound=ModelSettings)
 
@@ -19,6 +23,21 @@ SettingsT = TypeVar("SettingsT", bound=ModelSettings)
 def add_recording(parser: argparse.ArgumentParser) -> None:
     """Declare the recording."""
     parser.add_argument("recording", metavar="BAG", help="rosbag2 folder, or a single .mcap, .db3 or ROS 1 .bag file")
+
+
+def add_recordings(parser: argparse.ArgumentParser) -> None:
+    """Declare one or many recordings, for `find_recordings`."""
+    parser.add_argument(
+        "recordings",
+        nargs="+",
+        metavar="BAG",
+        help="rosbag2 folder, or .mcap, .db3 or ROS 1 .bag file; folder of these, glob, or URL (s3://bucket/drive.mcap)",
+    )
+
+
+def add_quiet(parser: argparse.ArgumentParser) -> None:
+    """Declare `--quiet`."""
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
 def add_window(parser: argparse.ArgumentParser) -> None:
@@ -81,10 +100,33 @@ def warn(text: str) -> None:
     print(f"warning: {text}", file=sys.stderr)
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Lay out columns as wide as their widest cell."""
+@contextmanager
+def recording_progress(
+    recording: "Recording", window: tuple[int, int | None], quiet: bool
+) -> Iterator[Callable[[int], None]]:
+    """Show on a terminal how much of the window is read; what is given is to be called with log times (ns)."""
+    from tqdm import tqdm
+
+    start, stop = window[0], min(window[1] or recording.end, recording.end)
+    form = "{percentage:3.0f}%|{bar}| {n:.1f} of {total:.1f} s recorded [{elapsed}<{remaining}]"
+    with tqdm(total=(stop - start) / 1e9, disable=True if quiet else None, bar_format=form, leave=False) as bar:
+
+        def show(log_time: int) -> None:
+            bar.update((log_time - start) / 1e9 - bar.n)
+
+        yield show
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]], numbers: Collection[int] = ()) -> str:
+    """Lay out columns as wide as their widest cell; those of `numbers` (from 0) are aligned at the right."""
     widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
-    lines = ("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in (header, *rows))
+    lines = (
+        "  ".join(
+            cell.rjust(width) if column in numbers else cell.ljust(width)
+            for column, (cell, width) in enumerate(zip(row, widths, strict=True))
+        )
+        for row in (header, *rows)
+    )
     return "\n".join(line.rstrip() for line in lines)
 
 

@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`inspect`: tell what is in recordings."""
+
+import argparse
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from datetime import datetime, timezone
+from typing import TYPE_CHECKING, Any
+
+from cvcdepth_core.errors import CvcDepthError, RecordingError
+from cvcdepth_ros.commands.arguments import (
+    add_json,
+    add_quiet,
+    add_recordings,
+    add_window,
+    print_result,
+    recording_progress,
+    table,
+    warn,
+    window_ns,
+)
+
+if TYPE_CHECKING:
+    from cvcdepth_ros.bags import Location
+    from cvcdepth_ros.recording_summary import CameraSummary, RecordingSummary, TopicSummary
+
+SUMMARY = """Tell what is in recordings: topics, rates, gaps, clocks, cameras, damage.
+
+Every message is read, so that damage shows; --start and --duration take a part. Times are those of the header stamps
+where a type has one: gap is the largest interval, gaps how many exceed twice the median, jitter how far 95 % of the
+intervals keep to the median, clock by how much later messages are recorded than stamped (median)."""
+EXAMPLES: tuple[str, ...] = (
+    "inspect drive.mcap",
+    "inspect drives/ 'archive/*/*.db3' --json",
+    "inspect s3://fleet/2026/drive.mcap --start 60 --duration 5",
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_recordings(parser)
+    add_window(parser)
+    add_quiet(parser)
+    add_json(parser)
+
+
+def execute(arguments: argparse.Namespace) -> None:
+    """Describe each recording; RecordingError at the end when one could not be read."""
+    from cvcdepth_ros.bags import find_recordings
+
+    summaries, failures = [], []
+    for location in find_recordings(arguments.recordings):
+        try:
+            summaries.append(_summary(location, arguments))
+        except CvcDepthError as error:
+            failures.append(str(error))
+    result = {"recordings": [_json(summary) for summary in summaries], "failed": failures}
+    if summaries or arguments.json:
+        print_result(result, "\n\n".join(_text(summary) for summary in summaries), arguments.json)
+    for failure in failures[:-1]:
+        warn(failure)
+    if failures:
+        raise RecordingError(failures[-1])
+
+
+def _summary(location: "Location", arguments: argparse.Namespace) -> "RecordingSummary":
+    from cvcdepth_ros.bags import open_recording
+    from cvcdepth_ros.recording_summary import summarize
+
+    with open_recording(location) as recording:
+        window = window_ns(arguments, recording.start)
+        with recording_progress(recording, window, arguments.quiet) as progress:
+            return summarize(recording, *window, progress)
+
+
+def _json(summary: "RecordingSummary") -> dict[str, Any]:
+    content = asdict(summary) | {"index": summary.index}
+    for camera, stored in zip(summary.cameras, content["cameras"], strict=True):
+        stored["calibration"] = camera.calibration.model_dump(mode="json") if camera.calibration else None
+    for topic in content["topics"]:
+        clock = topic["timing"]["clock_offset"]
+        topic["timing"]["clock_offset"] = clock._asdict() if clock else None
+    return content
+
+
+def _text(summary: "RecordingSummary") -> str:
+    parts = [_headline(summary), *_damage(summary), "", _topics(summary.topics), "", _cameras(summary.cameras)]
+    return "\n".join(parts)
+
+
+def _headline(summary: "RecordingSummary") -> str:
+    begin = datetime.fromtimestamp(summary.start / 1e9, timezone.utc)
+    size, files = sum(file.bytes for file in summary.files), len(summary.files)
+    messages = sum(topic.timing.messages for topic in summary.topics)
+    return (
+        f"{summary.path}\n"
+        f"  {begin:%Y-%m-%d %H:%M:%S} UTC, {_seconds(summary.seconds)}, {messages} messages, {_bytes(size)}"
+        f"{f' in {files} files' if files > 1 else ''}; index {_INDEX[summary.index]}"
+    )
+
+
+_INDEX = {
+    "intact": "intact",
+    "rebuilt": "missing: it was rebuilt by reading the file through",
+    "damaged": "or content damaged:",
+}
+
+
+def _damage(summary: "RecordingSummary") -> Iterable[str]:
+    return [f"  {part}" for part in (summary.damage or "").split("; ") if part]
+
+
+def _topics(topics: Sequence["TopicSummary"]) -> str:
+    header = ("topic", "type", "messages", "Hz", "gap ms", "gaps", "jitter ms", "clock ms", "size")
+    rows = [_topic_row(topic) for topic in topics]
+    return table(header, rows, numbers=range(2, len(header)))
+
+
+def _topic_row(topic: "TopicSummary") -> tuple[str, ...]:
+    timing = topic.timing
+    several = timing.messages > 1
+    clock = timing.clock_offset
+    return (
+        topic.name,
+        topic.type.rpartition("/")[2],
+        str(timing.messages),
+        "" if timing.rate is None else f"{timing.rate:.1f}",
+        _milliseconds(timing.largest_gap),
+        str(timing.gaps) if several else "",
+        _milliseconds(timing.jitter),
+        _milliseconds(clock.median) if clock else "no stamp",
+        _bytes(timing.bytes),
+    )
+
+
+def _cameras(cameras: Sequence["CameraSummary"]) -> str:
+    if not cameras:
+        return "no cameras: a camera is a namespace with a camera_info and an image topic"
+    return table(("camera", "size", "distortion", "frame", "images"), [_camera_row(camera) for camera in cameras])
+
+
+def _camera_row(camera: "CameraSummary") -> tuple[str, ...]:
+    calibration = camera.calibration
+    if calibration is None:
+        size, distortion = "?", camera.problem or ""
+    else:
+        size = "{}x{}".format(*calibration.image_size)
+        distortion = calibration.distortion_model if any(calibration.d) else "none"
+    return (camera.name, size, distortion, camera.frame_id or "?", camera.encoding or "none readable")
+
+
+def _milliseconds(seconds: float | None) -> str:
+    if seconds is None:
+        return ""
+    milliseconds = 1e3 * seconds
+    return f"{milliseconds:.0f}" if abs(milliseconds) >= 100 else f"{milliseconds:.1f}"
+
+
+def _seconds(seconds: float) -> str:
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes // 60}:{minutes % 60:02}:{rest:02} h"
+
+
+def _bytes(size: float) -> str:
+    for unit in ("B", "kB", "MB"):
+        if size < 1000:
+            return f"{size:.3g} {unit}"
+        size /= 1000
+    return f"{size:.3g} GB"
