@@ -33,7 +33,7 @@ setup(
     maintainer_email="maintainers@cvcdepth.invalid",
     python_requires=">=3.10",
     packages=find_packages(include=["cvcdepth_core*", "cvcdepth_ros*"]),
-    package_data={"cvcdepth_core": ["py.typed"], "cvcdepth_ros": ["py.typed"]},
+    package_data={"cvcdepth_core": ["py.typed"], "cvcdepth_ros": ["py.typed", "evaluation/report/templates/*.html"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (str(SHARE), ["package.xml"]),
@@ -41,7 +41,7 @@ setup(
     ],
     # numpy 2 works with torch from 2.3 on.
     install_requires=["torch>=2.3", *requirements("core")],
-    extras_require={"ros-jazzy": requirements("ros"), "s3": requirements("s3")},
+    extras_require={"ros-jazzy": requirements("ros"), "s3": requirements("s3"), "report": requirements("report")},
     zip_safe=True,
     entry_points={
         "console_scripts": [

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,6 +42,7 @@ EXAMPLES: tuple[str, ...] = (
 )
 
 _METRICS_FILE, _FRAMES_FILE, _COMPARISON_FILE = "metrics.json", "per_frame.csv", "comparison.json"
+_REPORT_FILE = "report.html"
 _PARTS = "parts"
 
 
@@ -116,19 +118,35 @@ def _evaluated(
 
     if settings.untrained:
         warn("untrained: the network has random weights, and its depth means nothing")
-    result = _result(arguments, settings, folder)
+    drawable = _is_drawable()
+    jobs = _jobs(arguments, settings)
+    result = _result(arguments, settings, jobs, folder)
     content = result.to_json()
     folder.mkdir(parents=True, exist_ok=True)
     (folder / _METRICS_FILE).write_text(json.dumps(content) + "\n", encoding="utf-8")
     (folder / _FRAMES_FILE).write_text(to_csv(result.images), encoding="utf-8")
+    if drawable:
+        from cvcdepth_ros.evaluation.report.page import write_report
+
+        write_report(folder / _REPORT_FILE, result, {job.name: job for job in jobs})
     return folder, {name: value for name, value in content.items() if name != "rows"}, _text(result, folder)
 
 
-def _result(arguments: argparse.Namespace, settings: EvaluationSettings, folder: Path) -> "EvaluationResult":
+def _is_drawable() -> bool:
+    """Say, and tell before the work begins, whether the page can be made."""
+    missing = [name for name in ("jinja2", "matplotlib") if find_spec(name) is None]
+    if missing:
+        warn(f"no {_REPORT_FILE}: {' and '.join(missing)} not installed; pip install 'cvcdepth_ros[report]' brings it")
+    return not missing
+
+
+def _result(
+    arguments: argparse.Namespace, settings: EvaluationSettings, jobs: Sequence[EvaluationJob], folder: Path
+) -> "EvaluationResult":
     from cvcdepth_ros.evaluation.result import EvaluationResult, Failure
     from cvcdepth_ros.evaluation.workers import KeptParts, evaluate_all
 
-    model, jobs = _model(settings), _jobs(arguments, settings)
+    model = _model(settings)
     kept = KeptParts(folder / _PARTS, {"version": package_version(), "sha256": model.sha256})
     scores, failed = [], []
     with _progress(len(jobs), arguments.quiet) as progress:
