@@ -31,7 +31,7 @@ CLOCK_TOPIC = "/clock"
 _DEFAULT_DEPTH = 100
 _CLOCK_PERIOD = 0.02  # s of wall time
 _LARGE_MESSAGE = 66_000  # bytes; above, FastDDS sends a message in fragments
-_ACKNOWLEDGE_SECONDS = 1.0
+_ACKNOWLEDGE_SECONDS = 3.0
 _LAST_ACKNOWLEDGE_SECONDS = 5.0
 _WAIT_SECONDS = 0.1
 _SETTLING_SECONDS = 0.5
@@ -45,7 +45,7 @@ class PlayStatistics:
     published: Counter[str] = field(default_factory=Counter)
     """Messages per topic."""
     unacknowledged: Counter[str] = field(default_factory=Counter)
-    """Per topic, how often a subscriber had not acknowledged a large message within a second."""
+    """Per topic, how often a subscriber had not acknowledged a large message in time."""
     lateness: deque[float] = field(default_factory=lambda: deque(maxlen=_LATENESS_WINDOW))
     """Seconds between due time and publication of the last messages."""
 
@@ -129,7 +129,7 @@ class RecordingPlayer:
         self.statistics.published[message.topic] += 1
 
     def _wait_until_acknowledged(self, topic: str, publisher: Publisher) -> None:
-        """Wait at most a second, and not again for a subscriber that hangs or was killed."""
+        """Wait a while, and not again for a subscriber that hangs or was killed."""
         if _acknowledged(publisher, 0.0 if topic in self._stalled else _ACKNOWLEDGE_SECONDS):
             self._stalled.discard(topic)
         else:

@@ -131,7 +131,7 @@ def _text(result: dict[str, Any]) -> str:
         f"{sum(result['published'].values())} messages in {result['seconds']:.1f} s"
         f"{' until interrupted' if result['interrupted'] else ''}; late by {late['p50']} ms at the median, "
         f"{late['p95']} ms p95, {late['max']} ms at most",
-        *(f"{topic}: not acknowledged within 1 s {n} times" for topic, n in result["unacknowledged"].items()),
+        *(f"{topic}: a subscriber did not follow, {n} times" for topic, n in result["unacknowledged"].items()),
     ]
     return "\n".join(lines)
 

@@ -72,11 +72,12 @@ def execute(arguments: argparse.Namespace) -> None:
     """Run to the end or to Ctrl-C; the output is whole in both cases."""
     settings = settings_from(arguments, RunSettings)
     from cvcdepth_ros.bags import open_recording
-    from cvcdepth_ros.replay import DepthReplay, SurroundReplay
 
     if settings.untrained:
         warn("untrained: the network has random weights, and its depth means nothing")
     with open_recording(arguments.recording) as recording:
+        from cvcdepth_ros.replay import DepthReplay, SurroundReplay  # torch: not before there is a recording
+
         replay = SurroundReplay(recording, _layout(arguments, recording), settings)
         depths = DepthReplay(replay, settings.build_estimator())
         outcome = _record(arguments, settings, replay, depths)
