@@ -126,6 +126,7 @@ class Trainer:
             self.model.parameters(),
             lr=config.optimizer.learning_rate,
             betas=config.optimizer.betas,
+            fused=True,
             weight_decay=config.optimizer.weight_decay,
         )
         self._average = _averaged(self.model, config.optimizer.average_decay)

@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The training loop: what a run folder holds, what resuming computes, what a bad loss does."""
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from scenes import random_batch
+
+from cvcdepth_core.checkpoint import DepthModelSpec, load_checkpoint, save_checkpoint
+from cvcdepth_core.errors import CheckpointError, TrainingError
+from cvcdepth_core.networks import DepthNet
+from cvcdepth_core.training import Trainer, build_surround_model
+from cvcdepth_core.training_config import OptimizerConfig, PoseConfig, TrainingConfig
+
+SPEC = DepthModelSpec(encoder="efficientnet_lite0", height=64, width=64, min_depth=0.5, max_depth=80)
+
+
+@pytest.fixture(autouse=True)
+def _one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+class RandomBatches:
+    """A few samples of a small rig; `missing` batches could not be read."""
+
+    def __init__(self, missing: tuple[int, ...] = ()) -> None:
+        self.samples = 4
+        self._missing = missing
+
+    def epoch(self, number, first=0):
+        for position in range(first, self.samples):
+            torch.manual_seed(100 * number + position)
+            batch = random_batch(1, 3, SPEC.height, SPEC.width).to(dtype=torch.float32)
+            yield None if position in self._missing else batch
+
+
+def config(checkpoint_every=100, **changes: Any):
+    optimizer = OptimizerConfig(epochs=2, decay_after_epochs=1, samples_per_step=1, average_decay=0.9)
+    pose = PoseConfig(encoder="efficientnet_lite0")
+    optimizer = optimizer.model_copy(update=changes)
+    return TrainingConfig(depth=SPEC, pose=pose, optimizer=optimizer, checkpoint_every=checkpoint_every)
+
+
+def trainer(run, batches=None, **changes: Any):
+    settings = config(**changes)
+    return Trainer(settings, build_surround_model(settings), batches or RandomBatches(), run)
+
+
+def log_of(run):
+    return [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory):
+    torch.set_num_threads(1)
+    run = tmp_path_factory.mktemp("uninterrupted")
+    trainer(run).train(quiet=True)
+    return run
+
+
+def test_a_run_leaves_a_checkpoint_a_log_and_its_configuration(uninterrupted):
+    checkpoint = load_checkpoint(uninterrupted / "last.safetensors")
+    assert checkpoint.spec == SPEC
+    assert checkpoint.metadata["step"] == "8"
+    assert checkpoint.pose_net
+    log = log_of(uninterrupted)
+    assert [entry["step"] for entry in log] == list(range(1, 9))
+    assert {"temporal", "spatial", "depth_consistency"} <= log[0]["terms"].keys()
+    assert [entry["learning_rate"] for entry in log] == pytest.approx([1e-4] * 4 + [1e-5] * 4)
+    assert "learning_rate: 0.0001" in (uninterrupted / "config.yaml").read_text()
+
+
+@pytest.mark.parametrize("kill_at", [1, 6])
+def test_a_run_killed_at_any_moment_resumes_to_the_weights_of_an_uninterrupted_one(uninterrupted, tmp_path, kill_at):
+    script = (
+        "import sys, torch; from pathlib import Path; torch.set_num_threads(1); import test_training as t\n"
+        "run = t.trainer(Path(sys.argv[1]), checkpoint_every=1)\n"
+        "save = run.save\n"
+        "run.save = lambda: (save(), print(run.progress.step, flush=True))\n"
+        "run.train(quiet=True)\n"
+    )
+    folders = f"{Path(__file__).parent}:{Path(__file__).parent.parent}"
+    process = subprocess.Popen(
+        [sys.executable, "-c", script, tmp_path], stdout=subprocess.PIPE, text=True, env={"PYTHONPATH": folders}
+    )
+    assert process.stdout is not None
+    while int(process.stdout.readline()) < kill_at:
+        pass
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    resumed = trainer(tmp_path, checkpoint_every=1)
+    assert kill_at <= resumed.progress.step < 8
+    resumed.train(quiet=True)
+    expected, found = (load_checkpoint(run / "last.safetensors") for run in (uninterrupted, tmp_path))
+    assert found.metadata == expected.metadata
+    for networks in ("depth_net", "pose_net"):
+        weights, same = getattr(expected, networks), getattr(found, networks)
+        assert weights.keys() == same.keys()
+        assert [name for name in weights if not torch.equal(weights[name], same[name])] == []
+    assert [entry["step"] for entry in log_of(tmp_path)] == list(range(1, 9))
+
+
+def test_a_finished_run_can_be_made_longer(uninterrupted, tmp_path):
+    for name in ("state.pt", "log.jsonl"):
+        (tmp_path / name).write_bytes((uninterrupted / name).read_bytes())
+    longer = trainer(tmp_path, epochs=3)
+    longer.train(quiet=True)
+    assert longer.progress.step == 12
+
+
+def test_a_folder_of_another_run_is_refused_by_what_differs(uninterrupted):
+    with pytest.raises(CheckpointError, match=r"state.pt: was made with another configuration \(optimizer\)"):
+        trainer(uninterrupted, learning_rate=1e-3)
+    fewer = RandomBatches()
+    fewer.samples = 3
+    with pytest.raises(CheckpointError, match="from 4 samples, now there are 3"):
+        trainer(uninterrupted, fewer)
+
+
+def test_the_average_of_the_weights_is_what_is_saved_and_validated(tmp_path):
+    settings = config(epochs=1)
+    seen = []
+    run = Trainer(
+        settings,
+        build_surround_model(settings),
+        RandomBatches(),
+        tmp_path,
+        validate=lambda model: seen.append((model, model.training)) or {"score": float(len(seen))},
+    )
+    run.train(quiet=True)
+    assert seen == [(run.result, False)] * 2  # before the first step and after the last
+    assert [entry["validation"]["score"] for entry in log_of(tmp_path) if "validation" in entry] == [1, 2]
+    saved = load_checkpoint(tmp_path / "last.safetensors").depth_net
+    key = "depth_decoder.decoder.0.conv.conv.weight"
+    assert torch.equal(saved[key], run.result.depth_net.state_dict()[key])
+    assert not torch.equal(saved[key], run.model.depth_net.state_dict()[key])
+
+
+def test_unreadable_batches_are_passed_over_and_counted(tmp_path):
+    run = trainer(tmp_path, RandomBatches(missing=(1, 2)), samples_per_step=2, epochs=1)
+    run.train(quiet=True)
+    assert (run.progress.step, run.progress.skipped, run.progress.unreadable) == (2, 0, 2)
+    assert all(entry["loss"] > 0 for entry in log_of(tmp_path))
+
+
+def test_a_loss_that_is_not_finite_changes_no_weight_and_ends_a_run_when_it_stays(tmp_path):
+    run = trainer(tmp_path, epochs=9)
+    before = {name: value.clone() for name, value in run.model.named_parameters()}
+    head = run.model.depth_net.depth_decoder.decoder[-1].conv.bias
+    with torch.no_grad():
+        head.fill_(float("nan"))
+    with pytest.raises(TrainingError, match=r"step 20: .* 20 steps in a row.*last.safetensors"):
+        run.train(quiet=True)
+    assert run.progress.skipped == 20
+    for name, value in run.model.named_parameters():
+        assert value is head or torch.equal(value, before[name])
+
+
+def test_the_gradient_of_a_step_is_the_mean_over_its_samples_however_they_are_batched(tmp_path):
+    run = trainer(tmp_path)
+    weight = run.model.pose_net.pose_decoder.net[0].weight
+    for samples in (1, 4):
+        weight.grad = torch.full_like(weight, 6.0)
+        run._scaled_gradient_norm(samples)
+        assert float(weight.grad.mean()) == pytest.approx(6 / samples)
+
+
+def test_training_starts_from_a_checkpoint_of_the_same_meaning_only(tmp_path):
+    torch.manual_seed(7)
+    network = DepthNet(SPEC.encoder)
+    save_checkpoint(tmp_path / "start.safetensors", SPEC.model_copy(update={"height": 128}), network.state_dict())
+    model = build_surround_model(config(), load_checkpoint(tmp_path / "start.safetensors"))
+    key = "depth_decoder.decoder.0.conv.conv.weight"
+    assert torch.equal(model.depth_net.state_dict()[key], network.state_dict()[key])
+    save_checkpoint(tmp_path / "other.safetensors", SPEC.model_copy(update={"max_depth": 200}), network.state_dict())
+    with pytest.raises(CheckpointError, match=r"other.safetensors: max_depth is 200.*depth.max_depth is 80"):
+        build_surround_model(config(), load_checkpoint(tmp_path / "other.safetensors"))
