@@ -52,6 +52,9 @@ def parse_options() -> argparse.Namespace:
     parser.add_argument("--pose-method", default="front", help="front, joint_front, joint or per_camera")
     parser.add_argument("--bf16", action="store_true", help="run the networks under bfloat16 autocast")
     parser.add_argument("--steps", type=int, default=5, help="measured steps, after one to warm up")
+    parser.add_argument(
+        "--clock", choices=["wall", "cpu"], default="wall", help="cpu: seconds of this process, for a shared machine"
+    )
     parser.add_argument("--threads", type=int, default=0, help="CPU threads, 0 for torch's choice")
     return parser.parse_args()
 
@@ -102,30 +105,34 @@ def timed_step(
         with torch.autocast(batch.frames.device.type, torch.bfloat16, enabled=options.bf16):
             return model(batch, batch.frames, no_flip, no_flip)  # type: ignore[no-any-return]
 
-    began = time.perf_counter()
+    began = now(options)
     optimizer.zero_grad(set_to_none=True)
-    prediction, forward = timed(options.device, predict)
+    prediction, forward = timed(options, predict)
     leaves = [
         tensor.detach().requires_grad_() for tensor in (prediction.disparity, prediction.depth, prediction.motions)
     ]
-    _, objective = timed(options.device, lambda: backpropagate_objective(batch, Prediction(*leaves), config))
+    _, objective = timed(options, lambda: backpropagate_objective(batch, Prediction(*leaves), config))
     outputs = [prediction.disparity, prediction.depth, prediction.motions]
     gradients = [leaf.grad for leaf in leaves]
-    _, backward = timed(options.device, lambda: torch.autograd.backward(outputs, gradients))
-    timed(options.device, optimizer.step)
-    return time.perf_counter() - began, forward + backward, objective
+    _, backward = timed(options, lambda: torch.autograd.backward(outputs, gradients))
+    timed(options, optimizer.step)
+    return now(options) - began, forward + backward, objective
 
 
 def backpropagate_objective(batch: RigBatch, prediction: Prediction, config: ObjectiveConfig) -> None:
     evaluate_objective(batch, prediction, config).loss.backward()  # type: ignore[no-untyped-call]
 
 
-def timed(device: str, work: Callable[[], Result]) -> tuple[Result, float]:
-    began = time.perf_counter()
+def timed(options: argparse.Namespace, work: Callable[[], Result]) -> tuple[Result, float]:
+    began = now(options)
     result = work()
-    if device.startswith("cuda"):
+    if options.device.startswith("cuda"):
         torch.cuda.synchronize()
-    return result, time.perf_counter() - began
+    return result, now(options) - began
+
+
+def now(options: argparse.Namespace) -> float:
+    return time.process_time() if options.clock == "cpu" else time.perf_counter()
 
 
 def ring_of_cameras(samples: int, height: int, width: int) -> RigBatch:
