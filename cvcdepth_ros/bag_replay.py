@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from cvcdepth_core.errors import CvcDepthError
-from cvcdepth_ros.commands import evaluate, inspect, play, rig, run
+from cvcdepth_ros.commands import check, evaluate, inspect, play, rig, run
 from cvcdepth_ros.version import package_version
 
 
@@ -28,7 +28,14 @@ class Command(Protocol):
         """Do the work; CvcDepthError says why it failed. `arguments.usage_error(text)` ends it as wrong use."""
 
 
-COMMANDS: Mapping[str, Command] = {"inspect": inspect, "rig": rig, "run": run, "evaluate": evaluate, "play": play}
+COMMANDS: Mapping[str, Command] = {
+    "inspect": inspect,
+    "check": check,
+    "rig": rig,
+    "run": run,
+    "evaluate": evaluate,
+    "play": play,
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -73,6 +73,13 @@ class RemotePath:
             matches = storage.glob(path) if any(sign in path for sign in "*[") else [path]
             return sorted(self._sibling(storage, file) for match in matches for file in storage.find(match))
 
+    def version(self) -> list[str | int]:
+        """Return the file's size and what its storage tells of its content or the time of its last change."""
+        with self._storage() as (storage, path):
+            about = storage.info(path)
+            tags = (about[key] for key in ("ETag", "etag", "mtime", "LastModified", "created") if about.get(key))
+            return [int(about["size"] or 0), str(next(tags, ""))]
+
     def open(self, mode: str = "rb") -> BinaryIO:
         """Open the file for reading bytes at any place; only what is read, and a little beyond, is fetched."""
         if mode != "rb":

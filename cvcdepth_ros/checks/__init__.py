@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Will this recording and this rig work? Numbered checks, each with its remedy. Nothing here imports ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+from cvcdepth_ros.checks.context import CheckContext, CheckOptions, CheckResult, Status
+from cvcdepth_ros.checks.rig_checks import check_camera_infos, check_cameras, check_encodings, check_transforms
+from cvcdepth_ros.checks.scene_checks import check_lidar, check_masks, check_motion, check_overlaps
+from cvcdepth_ros.checks.time_checks import check_sets, check_stamps
+
+__all__ = ["CHECKS", "CheckContext", "CheckOptions", "CheckResult", "NumberedResult", "Status", "run_checks"]
+
+CHECKS: Mapping[str, Callable[[CheckContext], CheckResult]] = {
+    "cameras": check_cameras,
+    "camera_info": check_camera_infos,
+    "transforms": check_transforms,
+    "stamps": check_stamps,
+    "sets": check_sets,
+    "overlaps": check_overlaps,
+    "ego masks": check_masks,
+    "LiDAR": check_lidar,
+    "motion": check_motion,
+    "encodings": check_encodings,
+}
+
+
+class NumberedResult(NamedTuple):
+    """What one of `CHECKS` found; numbers count from 1."""
+
+    number: int
+    name: str
+    result: CheckResult
+
+
+def run_checks(context: CheckContext) -> list[NumberedResult]:
+    """Run all checks, each whatever the others found."""
+    return [NumberedResult(number, name, check(context)) for number, (name, check) in enumerate(CHECKS.items(), 1)]

@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What all checks look at: one recording, read once, with its rig as far as it can be told."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cvcdepth_core.errors import ImageError, RecordingError, RigError, TransformError
+from cvcdepth_core.images import Picture
+from cvcdepth_core.rig import Rig, RigLayout
+from cvcdepth_ros.bags import RecordedMessage, Recording
+from cvcdepth_ros.lidar import VehicleMotion, cloud_topics
+from cvcdepth_ros.messages import picture_from_message
+from cvcdepth_ros.recorded_rig import collect_rig, discover_layout
+from cvcdepth_ros.rig_assembly import RigAssembler
+from cvcdepth_ros.topic_timing import TopicTiming
+
+Status = Literal["passed", "warning", "failed", "skipped"]
+
+_KEPT_SWEEPS = 3
+
+
+@dataclass(frozen=True)
+class CheckResult:
+    """What one check found."""
+
+    status: Status
+    """skipped: there is nothing to check, or what it needs is missing and told by another check."""
+    finding: str
+    """One line, with the values that were seen."""
+    remedy: str | None = None
+    """What to do about it."""
+    values: dict[str, Any] = field(default_factory=dict)
+    """The values, for machines."""
+
+
+@dataclass(frozen=True)
+class CheckOptions:
+    """What the recording is to be good for."""
+
+    tolerance: float = 0.1
+    """Seconds that two images of one set may be apart."""
+    queue_size: int = 10
+    """Images that are kept per camera while their set is not complete."""
+    base_frame: str = "base_link"
+    """The vehicle's frame where no rig file names it."""
+    lidar: tuple[str, ...] | None = None
+    """LiDAR topics; None for all point clouds of the recording."""
+    start: int | None = None
+    """First log time to read, ns."""
+    stop: int | None = None
+    """Log time to read to (exclusive), ns."""
+
+
+class CheckContext:
+    """One recording, read once."""
+
+    def __init__(
+        self,
+        recording: Recording,
+        options: CheckOptions,
+        rig_layout: RigLayout | None = None,
+        progress: Callable[[int], None] | None = None,
+    ) -> None:
+        """Read the window of the recording; `progress` is called with log times (ns)."""
+        self.recording = recording
+        self.options = options
+        self.has_rig_file = rig_layout is not None
+        self.contradiction: str | None = None
+        """Why the recorded transforms make no tree."""
+        self.assembler = self._collected(rig_layout)
+        """None where fewer than two cameras are found, or the transforms contradict each other."""
+        self.lidars = options.lidar if options.lidar is not None else tuple(cloud_topics(recording))
+        self.motion = self._found_motion()
+        self.motion_problem: str | None = None
+        """The first impossible pose."""
+        self.timings: dict[str, TopicTiming] = {}
+        """Of the topics with images and LiDAR sweeps."""
+        self.images: list[tuple[str, int]] = []
+        """Camera and stamp (ns) of every image, in the order of recording."""
+        self.sweeps: dict[str, list[Any]] = defaultdict(list)
+        """The first sweeps of each LiDAR; RecordingError in place of one that is no message."""
+        self._first_images: dict[str, RecordedMessage] = {}
+        self._read(progress)
+
+    @property
+    def layout(self) -> RigLayout | None:
+        """The cameras: the rig file's, or those found, ordered around the vehicle where their poses are known."""
+        if self.assembler is None:
+            return None
+        if self.has_rig_file or self.assembler.problems():
+            return self.assembler.layout
+        return self.assembler.completed_layout()
+
+    @cached_property
+    def rig(self) -> Rig | None:
+        """The complete rig; None where something is missing, which the checks of its parts tell."""
+        if self.layout is None or self.assembler is None or self.assembler.problems():
+            return None
+        return self.assembler.rig()
+
+    @cached_property
+    def pictures(self) -> dict[str, Picture | str]:
+        """Each camera's first image, or why it cannot be decoded; cameras without an image are absent."""
+        return {camera: self._picture(camera, message) for camera, message in self._first_images.items()}
+
+    def stamps(self, camera: str) -> NDArray[np.int64]:
+        """Return the stamps [M] of a camera's images, ns, sorted."""
+        return np.array(sorted(stamp for name, stamp in self.images if name == camera), dtype=np.int64)
+
+    def _collected(self, layout: RigLayout | None) -> RigAssembler | None:
+        try:
+            layout = layout or discover_layout(self.recording, self.options.base_frame)
+            return collect_rig(self.recording, layout)
+        except TransformError as error:
+            self.contradiction = str(error)
+        except (RecordingError, RigError):
+            pass
+        return None
+
+    def _found_motion(self) -> VehicleMotion | None:
+        if self.assembler is None:
+            return None
+        return VehicleMotion.find(self.recording, self.assembler.layout.base_frame, self.assembler.transforms)
+
+    def _read(self, progress: Callable[[int], None] | None) -> None:
+        cameras = self._cameras_by_topic()
+        moving = [self.motion.topic] if self.motion else []
+        topics = {*cameras, *self.lidars, *moving} & self.recording.topics.keys()
+        for message in self.recording.messages(topics, self.options.start, self.options.stop):
+            if message.topic in moving:
+                self._add_motion(message)
+            else:
+                self._add_stamped(message, cameras.get(message.topic, ()))
+            if progress:
+                progress(message.log_time)
+
+    def _cameras_by_topic(self) -> dict[str, list[str]]:
+        found: dict[str, list[str]] = defaultdict(list)
+        for camera in self.assembler.layout.cameras if self.assembler else ():
+            found[camera.image_topic].append(camera.name)
+        return found
+
+    def _add_stamped(self, message: RecordedMessage, cameras: Iterable[str]) -> None:
+        """Take in an image or a sweep."""
+        if message.topic not in self.timings:
+            type_ = self.recording.topics[message.topic].type
+            self.timings[message.topic] = TopicTiming(type_, self.recording.typestore)
+        stamp = self.timings[message.topic].add(message)
+        for camera in cameras:
+            self._first_images.setdefault(camera, message)
+            if stamp is not None:
+                self.images.append((camera, stamp))
+        if message.topic in self.lidars and len(self.sweeps[message.topic]) < _KEPT_SWEEPS:
+            self.sweeps[message.topic].append(self._deserialized(message))
+
+    def _add_motion(self, message: RecordedMessage) -> None:
+        try:
+            if self.motion is not None:
+                self.motion.add(self.recording.deserialize(message))
+        except (RecordingError, TransformError) as error:
+            self.motion_problem = self.motion_problem or str(error)
+
+    def _deserialized(self, message: RecordedMessage) -> Any:
+        try:
+            return self.recording.deserialize(message)
+        except RecordingError as error:
+            return error
+
+    def _picture(self, camera: str, message: RecordedMessage) -> Picture | str:
+        try:
+            return picture_from_message(self.recording.deserialize(message), camera)
+        except (ImageError, RecordingError) as error:
+            return str(error)

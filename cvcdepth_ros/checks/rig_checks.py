@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checks of the cameras: whether they are there, calibrated and connected, and their images can be decoded."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from cvcdepth_ros.bags import Recording
+from cvcdepth_ros.camera_discovery import CAMERA_INFO_TYPE, COMPRESSED_IMAGE_TYPE, IMAGE_TYPE
+from cvcdepth_ros.checks.context import CheckContext, CheckResult
+from cvcdepth_ros.recorded_rig import STATIC_TRANSFORMS, recorded_cameras, topic_problems
+from cvcdepth_ros.transforms import frame_name
+
+_INFO = "camera_info"
+_TOLD = 2
+
+
+def check_cameras(context: CheckContext) -> CheckResult:
+    """Look for the rig file's cameras, or for any; half recorded ones count too."""
+    recording = context.recording
+    if context.has_rig_file and context.assembler is not None:
+        layout = context.assembler.layout
+        problems = [*topic_problems(recording, layout)]
+        remedy = "correct the topics in the rig file; `bag_replay inspect` lists those recorded"
+        return _judged(problems, remedy, f"{len(layout.names)} of the rig file: {', '.join(layout.names)}")
+    names = [camera.name for camera in recorded_cameras(recording)]
+    found = f"{len(names)} found: {', '.join(names)}" if names else "none found"
+    values = {"cameras": names, "without_images": [*_blind(recording)], "without_camera_info": [*_unknown(recording)]}
+    if values["without_images"]:
+        remedy = "record its images, or give a rig file without this camera (--rig)"
+        return CheckResult("failed", f"{found}; no image beside {', '.join(values['without_images'])}", remedy, values)
+    if len(names) < 2:
+        remedy = "record a camera_info beside the images of at least two cameras, in one namespace each"
+        return CheckResult("failed", f"{found}, two are needed", remedy, values)
+    if values["without_camera_info"]:
+        remedy = "record its camera_info, or give its calibration in a rig file (--rig)"
+        finding = f"{found}; no camera_info beside {', '.join(values['without_camera_info'])}"
+        return CheckResult("warning", finding, remedy, values)
+    return CheckResult("passed", found, values=values)
+
+
+def check_camera_infos(context: CheckContext) -> CheckResult:
+    """Validate each camera's calibration, and compare its size with that of the camera's first image."""
+    if context.assembler is None:
+        return _without_cameras()
+    assembler = context.assembler
+    problems, sizes = [], {}
+    for camera in assembler.layout.names:
+        calibration, picture = assembler.calibration(camera), context.pictures.get(camera)
+        if calibration is None:
+            problems.append(assembler.calibration_problem(camera) or "")
+            continue
+        sizes[camera] = "{}x{}".format(*calibration.image_size)
+        if picture is not None and not isinstance(picture, str):
+            seen = f"{picture.shape[1]}x{picture.shape[0]}"
+            if seen != sizes[camera]:
+                problems.append(f"camera {camera}: images of {seen}, but the calibration is for {sizes[camera]}")
+    distinct = ", ".join(dict.fromkeys(sizes.values()))
+    remedy = "calibrate the camera at the size that is recorded, or correct camera_info or the rig file"
+    return _judged(problems, remedy, f"{len(sizes)} valid, of the images' size ({distinct})", {"sizes": sizes})
+
+
+def check_transforms(context: CheckContext) -> CheckResult:
+    """Look for each camera's pose in the base frame."""
+    if context.contradiction is not None:
+        remedy = "one publisher of /tf_static too many: every frame has one parent"
+        return CheckResult("failed", context.contradiction, remedy)
+    if context.assembler is None:
+        return _without_cameras()
+    assembler, base_frame = context.assembler, context.assembler.layout.base_frame
+    problems = [problem for name in assembler.layout.names if (problem := assembler.transform_problem(name))]
+    frames = assembler.transforms.frames
+    passed, values = f"every camera is connected to {base_frame}", {"frames": frames}
+    if not frames:
+        remedy = f"record {STATIC_TRANSFORMS}, or give base_T_camera for every camera in a rig file (--rig)"
+        problems = [f"nothing on {STATIC_TRANSFORMS}"] if problems else []
+    elif frame_name(base_frame) not in frames:
+        remedy = (
+            f"name the vehicle's frame (--base-frame, or base_frame in the rig file); there are {', '.join(frames)}"
+        )
+        problems = [f"no frame is called {base_frame}"] if problems else []
+    else:
+        remedy = f"publish the missing transform on {STATIC_TRANSFORMS}, or give base_T_camera in a rig file (--rig)"
+    return _judged(problems, remedy, passed, values)
+
+
+def check_encodings(context: CheckContext) -> CheckResult:
+    """Decode the first image of each camera."""
+    if context.assembler is None:
+        return _without_cameras()
+    pictures = context.pictures
+    problems = [picture for picture in pictures.values() if isinstance(picture, str)]
+    problems += [f"camera {name}: no image" for name in context.assembler.layout.names if name not in pictures]
+    remedy = "record raw images (rgb8, bgr8, mono8, bayer_*) or CompressedImage with whole JPEG or PNG files"
+    return _judged(problems, remedy, f"the first image of {len(pictures)} cameras is decoded")
+
+
+def _judged(problems: list[str], remedy: str, passed: str, values: dict[str, object] | None = None) -> CheckResult:
+    values = {"problems": problems, **(values or {})}
+    if problems:
+        more = f"; and {len(problems) - _TOLD} more" if len(problems) > _TOLD else ""
+        return CheckResult("failed", "; ".join(problems[:_TOLD]) + more, remedy, values)
+    return CheckResult("passed", passed, values=values)
+
+
+def _without_cameras() -> CheckResult:
+    return CheckResult("skipped", "needs at least two cameras and transforms without contradictions")
+
+
+def _blind(recording: Recording) -> Iterator[str]:
+    """Give the camera_info topics beside which no image was recorded."""
+    seeing = {camera.camera_info_topic for camera in recorded_cameras(recording)}
+    for topic in recording.topics.values():
+        if topic.type == CAMERA_INFO_TYPE and topic.name not in seeing and not _is_of_depth(topic.name):
+            yield topic.name
+
+
+def _unknown(recording: Recording) -> Iterator[str]:
+    """Give the image topics beside which no camera_info was recorded."""
+    known = tuple(camera.camera_info_topic.removesuffix(_INFO) for camera in recorded_cameras(recording))
+    for topic in recording.topics.values():
+        is_picture = topic.type in (IMAGE_TYPE, COMPRESSED_IMAGE_TYPE) and not _is_of_depth(topic.name)
+        if is_picture and topic.count and not topic.name.startswith(known):
+            yield topic.name
+
+
+def _is_of_depth(topic: str) -> bool:
+    return any(part.lower().startswith(("depth", "compresseddepth")) for part in topic.split("/"))

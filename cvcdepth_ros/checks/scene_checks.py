@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checks of what the cameras see: each other's views, the vehicle itself, what the LiDAR sees, and motion."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cvcdepth_core.errors import RecordingError, RigError, TransformError
+from cvcdepth_core.ground_truth import PinholeView
+from cvcdepth_core.preprocess import Rectifier, self_occlusion_mask
+from cvcdepth_core.rig import Camera, Rig
+from cvcdepth_ros.checks.context import CheckContext, CheckResult, Status
+from cvcdepth_ros.lidar import LidarSweeps
+from cvcdepth_ros.messages import stamp_ns
+from cvcdepth_ros.synchronizer import NANOSECONDS
+from cvcdepth_ros.transforms import TransformTree
+
+_NEEDS_RIG = CheckResult("skipped", "needs all cameras with calibration and transform")
+_MOSTLY_MASKED = 0.6
+_MASK_STEP = 4  # pixels of the image for one of the mask's that is looked at
+_PLAUSIBLE_DEPTH = (0.5, 200.0)  # metres
+_FEW_POINTS = 0.01
+_LIDAR_TOLERANCE = 0.1  # seconds
+_MOVING = 0.5  # metres per second
+_ENOUGH_MOTION = 0.2
+
+
+def check_overlaps(context: CheckContext) -> CheckResult:
+    """Look for a neighbour of every camera: metric scale is learned where two cameras see the same."""
+    if context.rig is None:
+        return _NEEDS_RIG
+    neighbours, angles = context.rig.neighbours, {(o.camera, o.neighbour): o.angle for o in context.rig.overlaps}
+    pairs = {tuple(sorted((name, other))) for name, others in neighbours.items() for other in others}
+    values = {"degrees": {f"{a} - {b}": round(angles.get((a, b), 0.0), 1) for a, b in sorted(pairs)}}
+    lonely = [name for name, others in neighbours.items() if not others]
+    if lonely:
+        remedy = "correct the calibration or transform; training needs overlaps, depth from a checkpoint does not"
+        status: Status = "failed" if len(lonely) == len(neighbours) else "warning"
+        return CheckResult(status, f"{', '.join(lonely)} shares no view with another camera", remedy, values)
+    narrowest = min(values["degrees"], key=values["degrees"].__getitem__)
+    finding = f"{len(pairs)} pairs of cameras, the narrowest {narrowest} ({values['degrees'][narrowest]:.1f} degrees)"
+    return CheckResult("passed", finding, values=values)
+
+
+def check_masks(context: CheckContext) -> CheckResult:
+    """Measure which share of each image the rig file's masks take away, and where."""
+    if context.rig is None:
+        return _NEEDS_RIG
+    masked = [camera for camera in context.rig.cameras if camera.mask is not None]
+    if not masked:
+        remedy = "where a camera sees the vehicle itself, name a mask in the rig file: that is no scene to learn from"
+        return CheckResult("skipped", "the rig has no masks", remedy)
+    try:
+        shares = {camera.name: _masked_shares(camera) for camera in masked}
+    except RigError as error:
+        return CheckResult("failed", str(error), "give a PNG of the image's size, 0 on the vehicle, 255 elsewhere")
+    values = {name: {"share": round(all_, 4), "upper_half": round(up, 4)} for name, (all_, up) in shares.items()}
+    finding = ", ".join(f"{name} {all_:.0%}" for name, (all_, _) in shares.items()) + " masked"
+    odd = [name for name, (all_, up) in shares.items() if all_ == 0 or all_ > _MOSTLY_MASKED or up > all_]
+    if odd:
+        remedy = "0 is the vehicle and 255 the scene: a mask takes away a smaller, lower part of the image"
+        return CheckResult("warning", f"{finding}; not plausible: {', '.join(odd)}", remedy, values)
+    return CheckResult("passed", finding, values=values)
+
+
+def _masked_shares(camera: Camera) -> tuple[float, float]:
+    """Return the masked share of the whole image and of its upper half."""
+    width, height = (max(2, size // _MASK_STEP) for size in camera.calibration.image_size)
+    mask = self_occlusion_mask(camera, Rectifier(camera.calibration, height, width, camera.rectified)) < 0.5
+    return float(mask.mean()), float(mask[: height // 2].mean())
+
+
+def check_lidar(context: CheckContext) -> CheckResult:
+    """Project a sweep of each LiDAR into every camera at the moment of its nearest image."""
+    missing = [topic for topic in context.lidars if topic not in context.sweeps]
+    if missing:
+        remedy = "name a recorded topic of point clouds; `bag_replay inspect` lists them"
+        return CheckResult("failed", f"no sweep on {', '.join(missing)}", remedy, {"missing": missing})
+    if not context.lidars:
+        remedy = "without a LiDAR, `evaluate` gives the label-free scores only"
+        return CheckResult("warning", "no point cloud is recorded", remedy)
+    rig, assembler = context.rig, context.assembler
+    if rig is None or assembler is None:
+        return _NEEDS_RIG
+    try:
+        shares = {topic: _projected(context, rig, topic, assembler.transforms) for topic in context.lidars}
+    except (RecordingError, TransformError) as error:
+        remedy = "publish the LiDAR's frame on /tf_static; clouds need x, y and z as float32 or float64"
+        return CheckResult("failed", str(error), remedy)
+    return _judge_projection(shares)
+
+
+def _judge_projection(shares: dict[str, dict[str, float]]) -> CheckResult:
+    cameras = dict.fromkeys(camera for found in shares.values() for camera in found)
+    best = {camera: max(found.get(camera, 0.0) for found in shares.values()) for camera in cameras}
+    unseen = [camera for camera, share in best.items() if share < _FEW_POINTS]
+    finding = "; ".join(
+        f"{topic}: {', '.join(f'{camera} {share:.0%}' for camera, share in found.items()) or 'no image near a sweep'}"
+        for topic, found in shares.items()
+    )
+    finding += " of the points are in the image"
+    remedy = "compare the LiDAR's transform with the cameras', and their clocks"
+    if len(unseen) == len(best):
+        return CheckResult("failed", finding, remedy, shares)
+    if unseen:
+        return CheckResult("warning", f"{finding}; hardly any in {', '.join(unseen)}", remedy, shares)
+    return CheckResult("passed", finding, values=shares)
+
+
+def _projected(context: CheckContext, rig: Rig, topic: str, transforms: TransformTree) -> dict[str, float]:
+    """Return for each camera the share of one sweep's points that are in its image at a plausible depth.
+
+    Of the sweeps that were kept it is the first whose cameras' moments the recorded motion reaches.
+    """
+    refusal: TransformError | None = None
+    for message in context.sweeps[topic]:
+        if isinstance(message, RecordingError):
+            raise message
+        lidar = LidarSweeps([topic], rig.base_frame, transforms, context.motion, _LIDAR_TOLERANCE)
+        lidar.add(topic, message)
+        try:
+            return {
+                camera.name: _share_inside(camera, swept.points)
+                for camera in rig.cameras
+                if (swept := lidar.at(_nearest(context.stamps(camera.name), stamp_ns(message)))) is not None
+            }
+        except TransformError as error:
+            refusal = error
+    if refusal is not None:
+        raise refusal
+    return {}
+
+
+def _nearest(stamps: NDArray[np.int64], stamp: int) -> int:
+    """Return the nearest stamp; the given one where there are none."""
+    return int(stamps[np.argmin(abs(stamps - stamp))]) if stamps.size else stamp
+
+
+def _share_inside(camera: Camera, points: NDArray[np.float64]) -> float:
+    view = PinholeView.of(camera)
+    (u, v), z = (found.T for found in view.project(points))
+    nearest, farthest = _PLAUSIBLE_DEPTH
+    inside = (u >= -0.5) & (u < view.width - 0.5) & (v >= -0.5) & (v < view.height - 0.5)
+    return float((inside & (z > nearest) & (z < farthest)).mean()) if len(points) else 0.0
+
+
+def check_motion(context: CheckContext) -> CheckResult:
+    """Measure how far and how long the vehicle moves: one that stands gives nothing to learn from."""
+    layout = context.layout
+    if layout is None:
+        return _NEEDS_RIG
+    if context.motion is None:
+        remedy = f"record /tf or an odometry topic that ends in {layout.base_frame}; training then need not guess"
+        return CheckResult("warning", "motion unknown: neither /tf nor odometry is recorded", remedy)
+    times, positions = _track(context, layout.anchor_camera)
+    if len(times) < 2:
+        reason = context.motion_problem or f"{context.motion.topic} does not reach the images' stamps"
+        return CheckResult("warning", f"motion unknown: {reason}", "stamp poses and images with the same clock")
+    steps, seconds = np.linalg.norm(np.diff(positions, axis=0), axis=1), np.diff(times)
+    distance, duration = float(steps.sum()), float(seconds.sum())
+    share = float(seconds[steps / seconds > _MOVING].sum()) / duration
+    values = {"metres": round(distance, 2), "seconds": round(duration, 2), "moving_share": round(share, 3)}
+    finding = f"{distance:.1f} m in {duration:.1f} s, faster than {_MOVING:g} m/s for {share:.0%} of it"
+    remedy = "training needs a moving vehicle: choose another recording, or another part with --start and --duration"
+    if share < _ENOUGH_MOTION:
+        return CheckResult("warning" if share else "failed", finding, remedy, values)
+    return CheckResult("passed", f"{finding} ({context.motion.topic})", values=values)
+
+
+def _track(context: CheckContext, camera: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return times [M] (s) and positions [M, 3] (m) of the vehicle at the camera's images, where they are known."""
+    times, positions = [], []
+    for stamp in np.unique(context.stamps(camera)).tolist():
+        try:
+            positions.append(context.motion.base_pose(stamp)[:3, 3] if context.motion else np.zeros(3))
+        except TransformError:
+            continue
+        times.append(stamp / NANOSECONDS)
+    return np.array(times), np.array(positions).reshape(-1, 3)

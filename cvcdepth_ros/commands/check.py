@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`check`: say whether recordings and a rig will work."""
+
+import argparse
+import textwrap
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from cvcdepth_core.errors import CvcDepthError, RecordingError
+from cvcdepth_ros.commands.arguments import (
+    add_json,
+    add_quiet,
+    add_recordings,
+    add_window,
+    positive,
+    print_result,
+    recording_progress,
+    window_ns,
+)
+from cvcdepth_ros.settings import MatchingSettings
+
+if TYPE_CHECKING:
+    from cvcdepth_core.rig import RigLayout
+    from cvcdepth_ros.bags import Location
+    from cvcdepth_ros.checks import NumberedResult, Status
+
+SUMMARY = """Check whether recordings and a rig will work, with a remedy for what will not.
+
+Ten numbered checks: cameras, calibrations, transforms, stamps, sets, overlaps, masks, LiDAR, motion and encodings. The
+exit code is 1 when a check failed; warnings leave it at 0."""
+EXAMPLES: tuple[str, ...] = (
+    "check drive.mcap",
+    "check drives/ --rig rig.yaml --tolerance 0.05 --lidar /lidar/points --json",
+)
+
+_WIDTH = 118
+_INDENT = 25
+
+
+class Checked(NamedTuple):
+    """One recording's checks."""
+
+    recording: str
+    results: "list[NumberedResult]"
+    damage: str | None
+    unreadable: str | None
+    """Why there are no results."""
+
+    @property
+    def failed(self) -> list[str]:
+        """The names of the checks that failed."""
+        return [name for _, name, result in self.results if result.status == "failed"]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    tolerance = MatchingSettings.model_fields["tolerance"].default
+    add_recordings(parser)
+    parser.add_argument("--rig", type=Path, metavar="FILE", help="rig file [the cameras found in each recording]")
+    parser.add_argument(
+        "--base-frame", default="base_link", metavar="FRAME", help="without --rig: the vehicle's frame [base_link]"
+    )
+    parser.add_argument(
+        "--tolerance",
+        type=positive,
+        default=tolerance,
+        metavar="S",
+        help=f"seconds that two images of one set may be apart [{tolerance:g}]",
+    )
+    parser.add_argument(
+        "--lidar", action="append", metavar="TOPIC", help="a LiDAR; can be repeated [all point clouds of a recording]"
+    )
+    add_window(parser)
+    add_quiet(parser)
+    add_json(parser)
+
+
+def execute(arguments: argparse.Namespace) -> None:
+    """Check each recording; RecordingError at the end when a check failed."""
+    from cvcdepth_core.rig import load_rig_layout
+    from cvcdepth_ros.bags import find_recordings
+
+    layout = load_rig_layout(arguments.rig) if arguments.rig else None
+    checked = [_checked(location, layout, arguments) for location in find_recordings(arguments.recordings)]
+    result = {"recordings": [_json(one) for one in checked]}
+    print_result(result, "\n\n".join(_text(one) for one in checked), arguments.json)
+    bad = [f"{one.recording}: {_verdict(one)}" for one in checked if one.unreadable or one.failed]
+    if bad:
+        raise RecordingError("; ".join(bad))
+
+
+def _checked(location: "Location", layout: "RigLayout | None", arguments: argparse.Namespace) -> Checked:
+    from cvcdepth_ros.bags import open_recording
+    from cvcdepth_ros.checks import CheckContext, CheckOptions, run_checks
+
+    try:
+        with open_recording(location) as recording:
+            window = window_ns(arguments, recording.start)
+            options = CheckOptions(
+                tolerance=arguments.tolerance,
+                base_frame=arguments.base_frame,
+                lidar=tuple(arguments.lidar) if arguments.lidar else None,
+                start=window[0],
+                stop=window[1],
+            )
+            with recording_progress(recording, window, arguments.quiet) as progress:
+                context = CheckContext(recording, options, layout, progress)
+            return Checked(str(location), run_checks(context), recording.damage, None)
+    except CvcDepthError as error:
+        return Checked(str(location), [], None, str(error))
+
+
+def _json(checked: Checked) -> dict[str, Any]:
+    counts = Counter(result.status for _, _, result in checked.results)
+    return {
+        "recording": checked.recording,
+        "checks": [{"number": number, "name": name, **asdict(result)} for number, name, result in checked.results],
+        "counts": dict(counts),
+        "damage": checked.damage,
+        "unreadable": checked.unreadable,
+    }
+
+
+def _text(checked: Checked) -> str:
+    lines = [checked.recording, *(line for result in checked.results for line in _lines(result))]
+    if checked.damage:
+        lines += _wrapped("    damage", checked.damage)
+    if checked.unreadable:
+        return f"{checked.recording}\n{''.join(_wrapped('    unreadable', checked.unreadable))}"
+    return "\n".join([*lines, f"    {_verdict(checked)}"])
+
+
+def _lines(numbered: "NumberedResult") -> Iterator[str]:
+    number, name, result = numbered
+    yield from _wrapped(f"{number:>4}  {_SIGNS[result.status]}  {name}", result.finding)
+    if result.remedy:
+        yield from _wrapped("", f"-> {result.remedy}")
+
+
+_SIGNS = {"passed": "ok  ", "warning": "warn", "failed": "FAIL", "skipped": "-   "}
+
+
+def _wrapped(label: str, text: str) -> Sequence[str]:
+    """Lay out a text beside its label."""
+    first, rest = f"{label:<{_INDENT}}", " " * _INDENT
+    return textwrap.wrap(
+        text, _WIDTH, initial_indent=first, subsequent_indent=rest, break_long_words=False, break_on_hyphens=False
+    )
+
+
+def _verdict(checked: Checked) -> str:
+    if checked.unreadable:
+        return checked.unreadable
+    counts = Counter(result.status for _, _, result in checked.results)
+    told = [f"{counts[status]} {word}" for status, word in _WORDS.items() if counts[status]]
+    failed = f" ({', '.join(checked.failed)})" if checked.failed else ""
+    return f"{', '.join(told)}{failed}"
+
+
+_WORDS: dict["Status", str] = {
+    "passed": "passed",
+    "warning": "with a warning",
+    "skipped": "not applicable",
+    "failed": "failed",
+}
