@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Options and fixtures shared by the tests."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from s3_server import LocalS3, local_s3
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -13,3 +15,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         default=Path(__file__).parent / "golden",
         help="where test_golden.py finds the published program's arrays",
     )
+
+
+@pytest.fixture(scope="module")
+def s3() -> Iterator[LocalS3]:
+    """A local S3 server with an empty bucket; s3:// URLs lead to it."""
+    pytest.importorskip("moto", reason="no S3 server in this environment")
+    with local_s3() as server:
+        yield server

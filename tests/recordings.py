@@ -4,6 +4,7 @@
 They are made with rosbags, mcap and sqlite3, never with our own reader or writer: those are tested against them.
 """
 
+import itertools
 import shutil
 import sqlite3
 from collections import Counter
@@ -125,6 +126,28 @@ def changed(entries: Iterable[Entry], topic: str, change: Callable[[Any], None])
         message = JAZZY.deserialize_cdr(entry.cdr, entry.type)
         change(message)
         yield entry._replace(cdr=bytes(JAZZY.serialize_cdr(message, entry.type)))
+
+
+def without(entries: Iterable[Entry], *prefixes: str) -> list[Entry]:
+    """The same recording without the topics that begin so."""
+    return [entry for entry in entries if not entry.topic.startswith(prefixes)]
+
+
+def restamped(entries: Iterable[Entry], topic: str, stamp: Callable[[int, int], int]) -> Iterator[Entry]:
+    """The same recording with other header stamps on one topic: `stamp(number of the message, ns)`; log times stay."""
+    count = itertools.count()
+
+    def change(message: Any) -> None:
+        time = message.header.stamp
+        time.sec, time.nanosec = divmod(stamp(next(count), time.sec * 10**9 + time.nanosec), 10**9)
+
+    return changed(entries, topic, change)
+
+
+def with_gap(entries: Iterable[Entry], topic: str, first: int, last: int) -> Iterator[Entry]:
+    """The same recording, in which the messages number `first` to `last` of one topic were lost."""
+    number = itertools.count()
+    return (entry for entry in entries if entry.topic != topic or not first <= next(number) <= last)
 
 
 def _bayer_rggb(bgr: Any) -> Any:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from cvcdepth_ros.bags import Recording
 from cvcdepth_ros.camera_discovery import CAMERA_INFO_TYPE, COMPRESSED_IMAGE_TYPE, IMAGE_TYPE
@@ -95,7 +95,7 @@ def check_encodings(context: CheckContext) -> CheckResult:
     return _judged(problems, remedy, f"the first image of {len(pictures)} cameras is decoded")
 
 
-def _judged(problems: list[str], remedy: str, passed: str, values: dict[str, object] | None = None) -> CheckResult:
+def _judged(problems: list[str], remedy: str, passed: str, values: Mapping[str, object] | None = None) -> CheckResult:
     values = {"problems": problems, **(values or {})}
     if problems:
         more = f"; and {len(problems) - _TOLD} more" if len(problems) > _TOLD else ""
