@@ -64,7 +64,7 @@ class DepthEstimator:
         """`model_id` is what reports call the weights; ConfigError when `device` does not exist here."""
         self.spec = spec
         self.model_id = model_id
-        self.device = _resolve_device(device)
+        self.device = resolve_device(device)
         self._network = network.eval().to(self.device)
 
     @classmethod
@@ -123,7 +123,8 @@ class SurroundDepthEstimator:
         )
 
 
-def _resolve_device(name: str) -> torch.device:
+def resolve_device(name: str) -> torch.device:
+    """Return the device of that name, `auto` being CUDA where there is one; ConfigError when it is not there."""
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:

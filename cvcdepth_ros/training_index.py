@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import zipfile
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 
 from cvcdepth_core.errors import ImageError, RecordingError, RigError, TransformError
 from cvcdepth_core.rig import RigLayout
-from cvcdepth_ros.bags import RecordedMessage, Recording, open_recording
+from cvcdepth_ros.bags import Location, RecordedMessage, Recording, open_recording
 from cvcdepth_ros.camera_discovery import CAMERA_INFO_TYPE
 from cvcdepth_ros.lidar import VehicleMotion
 from cvcdepth_ros.messages import picture_from_message
@@ -38,7 +37,7 @@ _INFO_SUFFIX = "/camera_info"
 class RecordingIndex:
     """The S surround sets of one recording, in time order; N cameras in the rig's order."""
 
-    path: Path
+    path: Location
     layout: RigLayout
     """The rig, complete."""
     stamps: NDArray[np.int64]
@@ -62,7 +61,7 @@ class RecordingIndex:
 
 
 def load_index(
-    path: Path, directory: Path, matching: MatchingSettings, rig_layout: RigLayout | None = None
+    path: Location, directory: Path, matching: MatchingSettings, rig_layout: RigLayout | None = None
 ) -> RecordingIndex:
     """Return the index of the recording at `path`, from `directory` when a current one is there, else built and kept.
 
@@ -70,7 +69,7 @@ def load_index(
     RecordingError, RigError or TransformError, naming the recording, when it has no sets or no complete rig.
     """
     key = _key(path, matching, rig_layout)
-    cached = directory / f"{path.stem}-{hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:8]}.npz"
+    cached = directory / f"{path.name}-{hashlib.sha256(str(path).encode()).hexdigest()[:8]}.npz"
     index = _read(cached, path, key)
     if index is None:
         index = build_index(path, matching, rig_layout)
@@ -79,7 +78,7 @@ def load_index(
     return index
 
 
-def build_index(path: Path, matching: MatchingSettings, rig_layout: RigLayout | None = None) -> RecordingIndex:
+def build_index(path: Location, matching: MatchingSettings, rig_layout: RigLayout | None = None) -> RecordingIndex:
     """Read the whole recording once; see `load_index`."""
     with open_recording(path) as recording:
         layout = _complete_layout(recording, rig_layout)
@@ -181,22 +180,23 @@ def _table(sets: list[SurroundSet[int]], kept: list[int], row: Any) -> NDArray[n
     return np.array([row(sets[i]) for i in kept], dtype=np.int64).reshape(len(kept), -1)
 
 
-def _key(path: Path, matching: MatchingSettings, layout: RigLayout | None) -> str:
+def _key(path: Location, matching: MatchingSettings, layout: RigLayout | None) -> str:
     """Everything that an index depends on."""
     return json.dumps(
         {
             "format": _FORMAT,
-            "files": [[file.name, file.stat().st_size, file.stat().st_mtime_ns] for file in _files(path)],
+            "files": _file_identities(Path(str(path))),
             "matching": matching.model_dump(),
             "rig": None if layout is None else layout.model_dump(mode="json"),
         }
     )
 
 
-def _files(path: Path) -> Iterator[Path]:
-    if not path.exists():
-        raise RecordingError(f"{path}: does not exist")
-    yield from sorted(file for file in path.iterdir() if file.is_file()) if path.is_dir() else [path]
+def _file_identities(path: Path) -> list[list[str | int]]:
+    """Return name, size and modification time (ns) of the recording's files; nothing for one behind a URL."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    statuses = [(file.name, file.stat()) for file in files if file.is_file()]
+    return [[name, status.st_size, status.st_mtime_ns] for name, status in statuses]
 
 
 def _write(cached: Path, index: RecordingIndex, key: str) -> None:
@@ -210,7 +210,7 @@ def _write(cached: Path, index: RecordingIndex, key: str) -> None:
     )
 
 
-def _read(cached: Path, path: Path, key: str) -> RecordingIndex | None:
+def _read(cached: Path, path: Location, key: str) -> RecordingIndex | None:
     """Return what is kept in `cached` if it was built with the same `key`; None also when it cannot be read."""
     try:
         with np.load(cached, allow_pickle=False) as kept:
