@@ -38,8 +38,8 @@ def check_stamps(context: CheckContext) -> CheckResult:
 def _stamp_problem(timing: Timing) -> str | None:
     if not timing.stamped:
         return "all stamps are zero"
-    found = ((timing.steps_back, "steps back"), (timing.repeated, "repeated stamps"))
-    return ", ".join(f"{count} {what} in {timing.messages}" for count, what in found if count) or None
+    found = ((timing.steps_back, "step back"), (timing.repeated, "repeat"))
+    return ", ".join(f"{count} of {timing.messages} stamps {what}" for count, what in found if count) or None
 
 
 def check_sets(context: CheckContext) -> CheckResult:
