@@ -38,8 +38,9 @@ class RandomBatches:
 
     def epoch(self, number, first=0):
         for position in range(first, self.samples):
-            torch.manual_seed(100 * number + position)
-            batch = random_batch(1, 3, SPEC.height, SPEC.width).to(dtype=torch.float32)
+            with torch.random.fork_rng(devices=[]):  # nothing of the steps' own draws may come from here
+                torch.manual_seed(100 * number + position)
+                batch = random_batch(1, 3, SPEC.height, SPEC.width).to(dtype=torch.float32)
             yield None if position in self._missing else batch
 
 

@@ -132,6 +132,8 @@ def test_a_camera_that_fires_later_stands_further_along_the_way(index):
     ahead = (moved - fixed)[:, 0, 3]  # the base frame's x is forward
     np.testing.assert_allclose(ahead, delays * speed, atol=0.02)
     np.testing.assert_allclose(moved[index.anchor], fixed[index.anchor], atol=1e-9)
+    in_world = index.poses[5, index.anchor] @ moved
+    np.testing.assert_allclose(in_world, index.poses[5] @ fixed, atol=1e-9)
     assert np.ptp(ahead) > 0.2
 
 
