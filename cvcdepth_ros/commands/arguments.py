@@ -25,11 +25,11 @@ def add_recording(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("recording", metavar="BAG", help="rosbag2 folder, or a single .mcap, .db3 or ROS 1 .bag file")
 
 
-def add_recordings(parser: argparse.ArgumentParser) -> None:
+def add_recordings(parser: argparse.ArgumentParser, required: bool = True) -> None:
     """Declare one or many recordings, for `find_recordings`."""
     parser.add_argument(
         "recordings",
-        nargs="+",
+        nargs="+" if required else "*",
         metavar="BAG",
         help="rosbag2 folder, or .mcap, .db3 or ROS 1 .bag file; folder of these, glob, or URL (s3://bucket/drive.mcap)",
     )

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 from cvcdepth_core.errors import RecordingError
 from cvcdepth_ros.commands.arguments import (
     add_json,
+    add_quiet,
+    add_recordings,
     add_settings,
     add_window,
     print_result,
@@ -48,8 +50,15 @@ _PARTS = "parts"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("recordings", nargs="*", metavar="BAG", help="recordings, folders of them, globs, URLs")
-    parser.add_argument("-o", "--output", type=Path, default=Path("evaluation"), metavar="OUT", help="[evaluation]")
+    add_recordings(parser, required=False)
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        default=Path("evaluation"),
+        metavar="OUT",
+        help="folder of the results [evaluation]",
+    )
     network = add_settings(parser, EvaluationSettings, repeatable=["checkpoint"])
     network.add_argument(
         "--compare", nargs=2, type=Path, metavar=("A", "B"), help="two metrics.json: is B better than A?"
@@ -65,7 +74,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_window(parser)
     parser.add_argument("--workers", type=_workers, default=1, metavar="N", help="processes, a recording each [1]")
-    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+    parser.add_argument("--no-report", action="store_true", help=f"numbers only, no {_REPORT_FILE}")
+    add_quiet(parser)
     add_json(parser)
 
 
@@ -118,14 +128,14 @@ def _evaluated(
 
     if settings.untrained:
         warn("untrained: the network has random weights, and its depth means nothing")
-    drawable = _is_drawable()
+    with_report = not arguments.no_report and _is_drawable()
     jobs = _jobs(arguments, settings)
     result = _result(arguments, settings, jobs, folder)
     content = result.to_json()
     folder.mkdir(parents=True, exist_ok=True)
     (folder / _METRICS_FILE).write_text(json.dumps(content) + "\n", encoding="utf-8")
     (folder / _FRAMES_FILE).write_text(to_csv(result.images), encoding="utf-8")
-    if drawable:
+    if with_report:
         from cvcdepth_ros.evaluation.report.page import write_report
 
         write_report(folder / _REPORT_FILE, result, {job.name: job for job in jobs})
@@ -156,7 +166,7 @@ def _result(
             else:
                 scores.append(outcome)
                 _warn_of_damage(job, outcome)
-    for failure in failed:
+    for failure in failed if scores else failed[1:]:
         warn(f"not evaluated: {failure.reason}")
     if not scores:
         raise RecordingError(f"nothing could be evaluated: {failed[0].reason}")
@@ -167,7 +177,7 @@ def _result(
 
 def _jobs(arguments: argparse.Namespace, settings: EvaluationSettings) -> list[EvaluationJob]:
     from cvcdepth_core.rig import load_rig_layout
-    from cvcdepth_ros.bags.discovery import find_recordings
+    from cvcdepth_ros.bags import find_recordings
 
     locations = find_recordings(arguments.recordings)
     names = unique_names([(location.name, str(location)) for location in locations])
@@ -233,7 +243,11 @@ def _text(result: "EvaluationResult", folder: Path) -> str:
     groups = [(group, summary.mean[group], scaled.mean[group]) for group in result.scores.settings.groups]
     cameras = [(name, found[ALL], scaled.cameras[name][ALL]) for name, found in summary.cameras.items()]
     lines = [
-        *([table(header, [_row(*row) for row in (*cameras, *groups)])] if result.truth_points else []),
+        *(
+            [table(header, [_row(*row) for row in (*cameras, *groups)], numbers=range(1, len(header)))]
+            if result.truth_points
+            else []
+        ),
         *(f"not evaluated: {failure.reason}" for failure in result.failed),
         f"{len(result.sets)} sets of {len(result.recordings)} recordings, {result.truth_points} truth points",
         f"{folder}, of {result.model.id}",
@@ -257,7 +271,7 @@ def _comparison_text(content: dict[str, Any]) -> str:
         [
             f"A: {content['first']}",
             f"B: {content['second']}",
-            table(header, rows),
+            table(header, rows, numbers=range(1, 5)),
             f"{content['sets']} sets in both; only in A {content['only_in_first']}, only in B "
             f"{content['only_in_second']}; paired bootstrap of {content['resamples']} draws of blocks of "
             f"{content['block']} sets",

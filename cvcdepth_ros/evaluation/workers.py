@@ -15,6 +15,8 @@ from typing import Any
 
 from cvcdepth_core.checkpoint import write_atomically
 from cvcdepth_core.errors import CvcDepthError
+from cvcdepth_ros.bags import RemotePath
+from cvcdepth_ros.bags.remote import location
 from cvcdepth_ros.evaluation.job import EvaluationJob
 from cvcdepth_ros.evaluation.recording import Progress, RecordingScores, evaluate_recording
 from cvcdepth_ros.evaluation.result import Failure
@@ -42,28 +44,48 @@ class KeptParts:
 
     def save(self, job: EvaluationJob, scores: RecordingScores) -> None:
         """Keep the scores; the file appears whole or not at all."""
+        try:
+            work = self._work(job)
+        except OSError:
+            return  # the recording cannot be reached any more, so nobody can know it again
         self._folder.mkdir(parents=True, exist_ok=True)
-        content = {"work": self._work(job), "scores": scores.to_json()}
-        write_atomically(self._path(job), json.dumps(content).encode())
+        write_atomically(self._path(job), json.dumps({"work": work, "scores": scores.to_json()}).encode())
 
     def _path(self, job: EvaluationJob) -> Path:
         return self._folder / f"{hashlib.sha256(job.name.encode()).hexdigest()[:16]}.json"
 
     def _work(self, job: EvaluationJob) -> dict[str, Any]:
+        masks = [str(camera.mask) for camera in job.layout.cameras if camera.mask] if job.layout else []
         return {
             **self._depends_on,
             "configuration": job.configuration(),
             "name": job.name,
             "path": job.path,
-            "files": file_identity(Path(job.path)),
+            "files": [identity for path in (job.path, *masks) for identity in file_identities(path)],
         }
 
 
-def file_identity(path: Path) -> list[list[str | int]]:
-    """Return name, size and modification time (ns) of a file, or of all files of a folder."""
-    files = sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
-    statuses = [(file, file.stat()) for file in files if file.exists()]
+def file_identities(path: str) -> list[list[str | int]]:
+    """Tell the versions of a file, or of all files of a folder: size and time of change (ns).
+
+    Of a URL it is what the storage tells instead (S3: the ETag). Raises OSError when it cannot be reached.
+    """
+    place = location(path)
+    if isinstance(place, RemotePath):
+        return [[str(file), _remote_version(file)] for file in place.files()]
+    files = sorted(file for file in place.rglob("*") if file.is_file()) if place.is_dir() else [place]
+    statuses = [(file, file.stat()) for file in files]
     return [[str(file), status.st_size, status.st_mtime_ns] for file, status in statuses]
+
+
+def _remote_version(file: RemotePath) -> str:
+    from fsspec.core import url_to_fs
+
+    try:
+        storage, path = url_to_fs(str(file))
+        return str(storage.checksum(path))
+    except Exception as error:  # each storage's library has its own
+        raise OSError(f"{file}: {type(error).__name__}: {error}") from error
 
 
 def evaluate_all(

@@ -1,0 +1,504 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`bag_replay evaluate`: the depth that is scored, scores by strangers' arithmetic, many recordings, the page."""
+
+import csv
+import hashlib
+import json
+import math
+import re
+import shutil
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import recordings
+import torch
+from numpy.typing import NDArray
+from recordings import CAMERAS, SAMPLE, SAMPLE_MCAP
+from rosbags.highlevel import AnyReader
+
+from cvcdepth_core.checkpoint import DepthModelSpec, save_checkpoint
+from cvcdepth_core.networks import DepthNet
+from cvcdepth_core.reference_predictors import FixedDepth
+from cvcdepth_ros.bag_replay import main
+from cvcdepth_ros.commands import evaluate
+from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings
+from cvcdepth_ros.evaluation.recording import open_evaluation
+from cvcdepth_ros.replay import DepthReplay
+
+ROOT = Path(__file__).parent.parent
+SMALL = ("--untrained", "--height", "64", "--width", "96")
+CONSTANT = ("--predictor", "constant", "--height", "64", "--width", "96")
+Rows = dict[tuple[str, int, str], dict[str, str]]
+
+
+def score(output: Path, *arguments: str | Path, report: bool = False) -> dict[str, Any]:
+    """Evaluate; return metrics.json."""
+    options = ["-o", str(output), "--quiet", *([] if report else ["--no-report"])]
+    assert main(["evaluate", *map(str, arguments), *options]) == 0
+    return metrics_of(output)
+
+
+def metrics_of(output: Path) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads((output / "metrics.json").read_text())
+    return content
+
+
+def frames_of(output: Path) -> Rows:
+    with (output / "per_frame.csv").open(newline="") as stream:
+        return {(r["recording"], int(r["stamp_ns"]), r["camera"]): r for r in csv.DictReader(stream)}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def output(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The results of a constant predictor on the sample."""
+    folder = tmp_path_factory.mktemp("sample") / "scores"
+    score(folder, SAMPLE, *CONSTANT, "--no-occlusion-filter", report=True)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def two_sets(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The sample's first two sets, with LiDAR, transforms and motion."""
+    return recordings.write_rosbag2(tmp_path_factory.mktemp("short") / "two_sets", recordings.sample_entries(2))
+
+
+# The same depth everywhere
+
+
+def test_run_and_evaluate_and_the_live_node_give_the_same_depth_bit_for_bit(two_sets: Path, tmp_path: Path):
+    job = EvaluationJob("two_sets", str(two_sets), EvaluationSettings(untrained=True, height=64, width=96))
+    with open_evaluation(job) as evaluation:
+        scored = [measured.estimated.depth.depth for measured in evaluation.sets(*evaluation.window)]
+    assert len(scored) == 2
+    assert main(["run", str(two_sets), "-o", str(tmp_path / "depth"), *SMALL]) == 0
+    for index, name in enumerate(CAMERAS):
+        stored = depth_images(tmp_path / "depth", f"/surround_depth/{name}/depth/image_rect")
+        np.testing.assert_array_equal([depth[index] for depth in scored], list(stored.values()))
+    published = live_depth(two_sets, tmp_path)
+    for index, name in enumerate(CAMERAS):
+        stamps = depth_images(tmp_path / "depth", f"/surround_depth/{name}/depth/image_rect")
+        assert published[name]
+        for stamp, depth in published[name].items():
+            np.testing.assert_array_equal(depth, scored[list(stamps).index(stamp)][index])
+
+
+def depth_images(path: Path, topic: str) -> dict[tuple[int, int], NDArray[np.float32]]:
+    with AnyReader([path]) as reader:
+        connections = [c for c in reader.connections if c.topic == topic]
+        found = [reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages(connections)]
+    return {stamp_of(image): as_metres(image) for image in found}
+
+
+def as_metres(image: Any) -> NDArray[np.float32]:
+    return np.frombuffer(image.data, np.float32).reshape(image.height, image.width)
+
+
+def stamp_of(message: Any) -> tuple[int, int]:
+    return message.header.stamp.sec, message.header.stamp.nanosec
+
+
+def live_depth(recording: Path, folder: Path) -> dict[str, dict[tuple[int, int], NDArray[np.float32]]]:
+    """What the live node publishes for the sample's first two sets, by camera and stamp."""
+    pytest.importorskip("rclpy", reason="the live node needs a ROS environment")
+    from rclpy.serialization import deserialize_message
+    from ros_graph import RosGraph, reliable
+    from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+
+    rig = folder / "rig.yaml"
+    assert main(["rig", str(recording), "-o", str(rig)]) == 0
+    classes = {"sensor_msgs/msg/CompressedImage": CompressedImage, "sensor_msgs/msg/CameraInfo": CameraInfo}
+    entries = [entry for entry in recordings.sample_entries(2) if entry.type in classes]
+    topics = {name: f"/surround_depth/{name}/depth/image_rect" for name in CAMERAS}
+    graph = RosGraph()
+    try:
+        publishers = {e.topic: graph.node.create_publisher(classes[e.type], e.topic, reliable()) for e in entries}
+        graph.subscribe(Image, *topics.values())
+        graph.start_node(rig=rig, untrained=True, height=64, width=96, max_age=0.0)
+        graph.await_subscribers([e.topic for e in entries if "CompressedImage" in e.type])
+        graph.spin_until(
+            lambda: all(graph.node.count_publishers(topic) for topic in topics.values()), "the node's outputs"
+        )
+        for entry in sorted(entries, key=lambda entry: "CameraInfo" not in entry.type):
+            publishers[entry.topic].publish(deserialize_message(entry.cdr, classes[entry.type]))
+        graph.spin_until(lambda: all(graph.received[topic] for topic in topics.values()), "depth of every camera")
+        return {n: {stamp_of(m): as_metres(m) for m in graph.received[topic]} for n, topic in topics.items()}
+    finally:
+        graph.close()
+
+
+# The numbers
+
+
+def test_abs_rel_is_what_a_strangers_loops_find(output: Path):
+    """One image: sweep to world to camera by hand, the nearest point of each pixel, the mean of |10 - z| / z."""
+    errors = strangers_errors("left", 3)
+    key = next(key for i, key in enumerate(k for k in frames_of(output) if k[2] == "left") if i == 3)
+    row = frames_of(output)[key]
+    assert int(row["truth_points"]) == len(errors) > 1000
+    assert float(row["abs_rel"]) == pytest.approx(np.mean(errors), rel=1e-9)
+    assert float(row["coverage"]) == 1.0
+
+
+def strangers_errors(camera: str, index: int) -> list[float]:
+    messages: dict[str, list[Any]] = {}
+    with AnyReader([SAMPLE]) as reader:
+        for connection, _, raw in reader.messages():
+            messages.setdefault(connection.topic, []).append(reader.deserialize(raw, connection.msgtype))
+    static = {t.child_frame_id: matrix(t.transform) for m in messages["/tf_static"] for t in m.transforms}
+    odom = {
+        (t.header.stamp.sec, t.header.stamp.nanosec): matrix(t.transform) for m in messages["/tf"] for t in m.transforms
+    }
+    image = messages[f"/camera/{camera}/image_raw/compressed"][index]
+    info = messages[f"/camera/{camera}/camera_info"][index]
+    sweep = min(messages["/lidar/points"], key=lambda s: abs(seconds(s) - seconds(image)))
+    count = sweep.width * sweep.height
+    xyz = sweep.data.reshape(count, sweep.point_step)[:, :12].copy().view(np.float32).astype(float)
+    chain = (
+        np.linalg.inv(odom[stamp_of(image)] @ static[f"{camera}_camera_optical_frame"])
+        @ odom[stamp_of(sweep)]
+        @ static["pandar64"]
+    )
+    nearest: dict[tuple[int, int], float] = {}
+    for x, y, z in xyz @ chain[:3, :3].T + chain[:3, 3]:
+        if z > 0:
+            pixel = math.floor(info.k[0] * x / z + info.k[2] + 0.5), math.floor(info.k[4] * y / z + info.k[5] + 0.5)
+            if 0 <= pixel[0] < info.width and 0 <= pixel[1] < info.height:
+                nearest[pixel] = min(z, nearest.get(pixel, math.inf))
+    return [abs(10 - z) / z for z in nearest.values() if z < 80]
+
+
+def seconds(message: Any) -> float:
+    return float(message.header.stamp.sec - 1557539900 + message.header.stamp.nanosec * 1e-9)
+
+
+def matrix(transform: Any) -> NDArray[np.float64]:
+    q, t = transform.rotation, transform.translation
+    x, y, z, w = q.x, q.y, q.z, q.w
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w), t.x],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w), t.y],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y), t.z],
+            [0, 0, 0, 1],
+        ]
+    )
+
+
+def test_the_lidars_own_depth_as_prediction_has_no_error():
+    settings = EvaluationSettings(predictor="constant", height=64, width=96)
+    with open_evaluation(EvaluationJob("sample", str(SAMPLE), settings, duration=0.25)) as evaluation:
+        first = next(iter(evaluation.sets(*evaluation.window)))
+        depth = np.stack([truth.image() for truth in first.truth])
+        K = np.array([camera.calibration.rectified_intrinsics for camera in evaluation.replay.rig.cameras])
+    with open_evaluation(EvaluationJob("sample", str(SAMPLE), settings, duration=0.25)) as evaluation:
+        evaluation.depths = DepthReplay(evaluation.replay, FixedDepth(depth, K[:, 0, 0], "the LiDAR"))
+        again = next(iter(evaluation.sets(*evaluation.window)))
+    for samples in again.samples():
+        assert len(samples.truth) > 1000
+        np.testing.assert_allclose(samples.prediction, samples.truth, rtol=1e-6)
+
+
+def test_a_part_of_a_recording_scores_as_it_does_within_the_whole(output: Path, tmp_path: Path):
+    """The LiDAR and the motion just outside of the part count too."""
+    score(tmp_path, SAMPLE, *CONSTANT, "--no-occlusion-filter", "--start", "0.3", "--duration", "0.4")
+    whole, part = frames_of(output), frames_of(tmp_path)
+    assert len(part) in (18, 24)
+    for key, row in part.items():
+        assert [row[name] for name in ("truth_points", "abs_rel", "rmse")] == [
+            whole[key][name] for name in ("truth_points", "abs_rel", "rmse")
+        ]
+
+
+def test_the_occlusion_filter_takes_points_away(output: Path, tmp_path: Path):
+    filtered = score(tmp_path, SAMPLE, *CONSTANT)
+    everything = metrics_of(output)
+    assert 0.5 * everything["truth_points"] < filtered["truth_points"] < 0.99 * everything["truth_points"]
+
+
+def test_depth_limits_leave_truth_out(output: Path, tmp_path: Path):
+    limited = score(tmp_path, SAMPLE, *CONSTANT, "--no-occlusion-filter", "--min-depth", "10", "--max-depth", "20")
+    bins = [metrics_of(output)["scores"]["image"]["metric"]["mean"]["10-20"]["truth_points"]]
+    assert [limited["truth_points"]] == pytest.approx(bins, rel=1e-3)
+
+
+def test_without_lidar_the_label_free_scores_remain(two_sets: Path, tmp_path: Path):
+    result = score(
+        tmp_path, two_sets, "--predictor", "ground_plane", "--height", "64", "--width", "96", "--no-lidar", report=True
+    )
+    assert result["truth_points"] == 0
+    assert result["scores"]["image"]["metric"]["mean"]["all"]["abs_rel"] is None
+    kinds = {pair["kind"] for pair in result["label_free"]["pairs"] if pair["sets"]}
+    assert kinds == {"spatial", "temporal"}
+    page = (tmp_path / "report.html").read_text()
+    assert "No truth" in page
+    assert "Worst set" in page
+
+
+def test_flat_ground_agrees_with_itself_far_better_than_a_wall_around_every_camera(output: Path, tmp_path: Path):
+    flat = score(
+        tmp_path, SAMPLE, "--predictor", "ground_plane", "--height", "64", "--width", "96", "--duration", "0.3"
+    )
+    medians = [
+        np.median([p["median"] for p in result["label_free"]["pairs"] if p["kind"] == "spatial" and p["sets"]])
+        for result in (flat, metrics_of(output))
+    ]
+    assert medians[0] < 0.03 < medians[1]
+
+
+# What is written
+
+
+def test_metrics_json_has_exactly_the_fields_that_the_documentation_names(output: Path):
+    text = (ROOT / "docs" / "evaluation.md").read_text()
+    documented = set(re.findall(r"^\| `([^`]+)` \|", text.split("### metrics.json")[1].split("###")[0], re.MULTILINE))
+    assert documented == set(fields(metrics_of(output)))
+
+
+def fields(value: Any, path: str = "") -> Iterator[str]:
+    """Name the leaves as the documentation does: `*` for a name that varies, `[]` for list items."""
+    varies = {"cameras": "*", "mean": "*", "image": "*", "pool": "*", "image.*.cameras.*": "*"}
+    if path in ("configuration", "rows"):
+        yield path
+    elif isinstance(value, dict) and value:
+        for name, child in value.items():
+            star = any(path.endswith(end) for end in varies) or re.search(r"cameras\.\*$", path) or path == "scores"
+            yield from fields(child, f"{path}.{'*' if star else name}".lstrip("."))
+    elif isinstance(value, list) and value and isinstance(value[0], dict):
+        yield from fields(value[0], f"{path}[]")
+    else:
+        yield path
+
+
+def test_every_image_has_a_line(output: Path):
+    rows = frames_of(output)
+    assert len(rows) == 60
+    assert [key[2] for key in rows][:6] == list(CAMERAS)
+    result = metrics_of(output)
+    assert sum(int(row["truth_points"]) for row in rows.values()) == result["truth_points"]
+    left = [float(row["abs_rel"]) for key, row in rows.items() if key[2] == "left"]
+    assert np.mean(left) == pytest.approx(result["scores"]["image"]["metric"]["cameras"]["left"]["all"]["abs_rel"])
+
+
+class Page(HTMLParser):
+    """What a page loads, runs and shows."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.sources: list[str] = []
+        self.alts: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.sources += [value or "" for name, value in attrs if name in ("src", "href")]
+        self.alts += [value or "" for name, value in attrs if name == "alt"]
+
+
+def test_the_page_needs_nothing_beside_it_and_shows_every_picture(output: Path):
+    page = Page((output / "report.html").read_text())
+    assert all(source.startswith("data:image/") for source in page.sources)
+    assert not {"script", "link", "iframe"} & set(page.tags)
+    for name in CAMERAS:
+        assert [alt for alt in page.alts if alt.endswith(f"camera {name}")] == [
+            *(f"{which} set, error, camera {name}" for which in ("Best", "Median", "Worst")),
+            f"LiDAR, camera {name}",
+        ]
+    assert {"Abs Rel by range", "Abs Rel by camera", "Abs Rel over disagreement"} <= set(page.alts)
+
+
+def test_names_from_files_are_text_on_the_page_and_nothing_else(two_sets: Path, tmp_path: Path):
+    hostile = "a$b_<script>alert(1)</script>\"'&{{ 7 * 7 }}"
+    folder = tmp_path / hostile.replace("/", "_")
+    shutil.copytree(two_sets, folder)
+    result = score(tmp_path / "out", folder, *CONSTANT, report=True)
+    assert result["recordings"][0]["name"] == folder.name
+    text = (tmp_path / "out" / "report.html").read_text()
+    assert "script" not in Page(text).tags
+    assert "&lt;script&gt;" in text
+    assert "{{ 7 * 7 }}" in text
+
+
+def test_without_the_packages_for_the_page_everything_else_is_written(
+    two_sets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr(evaluate, "find_spec", lambda name: None if name == "matplotlib" else object())
+    assert score(tmp_path, two_sets, *CONSTANT, report=True)["sets"] == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "matplotlib" in line
+    assert "cvcdepth_ros[report]" in line
+    assert {path.name for path in tmp_path.iterdir()} == {"metrics.json", "per_frame.csv", "parts"}
+
+
+# Many recordings
+
+
+@pytest.fixture(scope="module")
+def drives(two_sets: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with an intact recording, one cut by a power loss, and a file that is none."""
+    folder = tmp_path_factory.mktemp("drives")
+    shutil.copytree(two_sets, folder / "two_sets")
+    recordings.cut(SAMPLE_MCAP, folder / "cut.mcap", 0.6)
+    (folder / "none.mcap").write_bytes(b"this was never a recording")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def in_turn(drives: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("in_turn")
+    score(folder, drives, *SMALL, report=True)
+    return folder
+
+
+def test_two_workers_give_exactly_the_files_of_one(drives: Path, in_turn: Path, tmp_path: Path):
+    score(tmp_path, drives, *SMALL, "--workers", "2", report=True)
+    for name in ("metrics.json", "per_frame.csv", "report.html"):
+        assert (tmp_path / name).read_bytes() == (in_turn / name).read_bytes()
+
+
+def test_a_recording_that_fails_is_named_and_stops_no_other(drives: Path, in_turn: Path):
+    result = metrics_of(in_turn)
+    assert [recording["name"] for recording in result["recordings"]] == ["cut.mcap", "two_sets"]
+    (failed,) = result["failed"]
+    assert failed["name"] == "none.mcap"
+    assert "begins with b'this was never" in failed["reason"]
+    assert "none.mcap" in (in_turn / "report.html").read_text()
+
+
+def test_a_cut_recording_is_scored_up_to_the_cut_and_says_how_much_that_is(
+    drives: Path, output: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    result = score(tmp_path, drives / "cut.mcap", *CONSTANT, "--no-occlusion-filter")
+    warning = capsys.readouterr().err
+    assert "not everything could be read" in warning
+    assert f"evaluated {result['sets']} sets" in warning
+    assert 3 <= result["sets"] < 10
+    whole = {key[1:]: row["abs_rel"] for key, row in frames_of(output).items()}
+    before_the_cut = {key[1:]: row["abs_rel"] for key, row in frames_of(tmp_path).items()}
+    last = max(stamp for stamp, _ in before_the_cut)
+    assert all(whole[key] == value for key, value in before_the_cut.items() if key[0] < last)
+
+
+def test_the_program_fails_only_when_nothing_could_be_evaluated(
+    drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    arguments = ["evaluate", str(drives / "none.mcap"), "-o", str(tmp_path / "out"), *CONSTANT]
+    assert main(arguments) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "nothing could be evaluated" in line
+    assert "none.mcap" in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_lidar_topic_that_is_not_there_is_named(two_sets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    arguments = ["evaluate", str(two_sets), "-o", str(tmp_path / "out"), *CONSTANT, "--lidar", "/roof"]
+    assert main(arguments) == 1
+    assert "LiDAR /roof: no such topic" in (line := capsys.readouterr().err)
+    assert "/lidar/points" in line
+
+
+def test_finished_recordings_are_not_done_again(two_sets: Path, tmp_path: Path):
+    """A mark in what was kept shows up in the result when, and only when, it was used."""
+    recording, out = tmp_path / "drive", tmp_path / "out"
+    shutil.copytree(two_sets, recording)
+    first = score(out, recording, *CONSTANT)
+    (part,) = (out / "parts").iterdir()
+
+    def mark() -> None:
+        content = json.loads(part.read_text())
+        content["scores"]["summary"]["damage"] = "kept"
+        part.write_text(json.dumps(content))
+
+    def was_kept(*options: str) -> bool:
+        mark()
+        return bool(score(out, recording, *CONSTANT, *options)["recordings"][0]["damage"] == "kept")
+
+    assert was_kept()
+    assert not was_kept("--max-depth", "60")
+    score(out, recording, *CONSTANT)
+    (recording / "metadata.yaml").touch()
+    assert not was_kept()
+    part.write_text(part.read_text()[:1000])
+    assert score(out, recording, *CONSTANT) == first
+
+
+# Comparison
+
+
+@pytest.fixture(scope="module")
+def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    folder = tmp_path_factory.mktemp("checkpoints")
+    spec = DepthModelSpec(encoder="resnet18", height=64, width=96, min_depth=1.5, max_depth=200.0)
+    paths = []
+    for seed, name in enumerate(("old", "new")):
+        torch.manual_seed(seed)
+        paths.append(folder / f"{name}.safetensors")
+        save_checkpoint(paths[-1], spec, DepthNet("resnet18").state_dict())
+    return paths
+
+
+def test_several_checkpoints_are_compared_with_the_first(two_sets: Path, checkpoints: list[Path], tmp_path: Path):
+    options = [word for path in checkpoints for word in ("--checkpoint", str(path))]
+    assert main(["evaluate", str(two_sets), *options, "-o", str(tmp_path), "--quiet", "--no-report"]) == 0
+    for path in checkpoints:
+        model = metrics_of(tmp_path / path.stem)["model"]
+        assert model["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
+        assert model["checkpoint"] == str(path)
+    comparison = json.loads((tmp_path / "new" / "comparison.json").read_text())
+    old, new = (metrics_of(tmp_path / name)["scores"]["image"]["metric"]["mean"]["all"] for name in ("old", "new"))
+    found = comparison["differences"]["metric"]["abs_rel"]
+    assert (found["first"], found["second"]) == pytest.approx((old["abs_rel"], new["abs_rel"]))
+    assert found["difference"] == pytest.approx(new["abs_rel"] - old["abs_rel"])
+    assert found["low"] <= found["difference"] <= found["high"]
+
+
+def test_a_result_does_not_differ_from_itself(output: Path, capsys: pytest.CaptureFixture[str]):
+    metrics = str(output / "metrics.json")
+    assert main(["evaluate", "--compare", metrics, metrics, "--json"]) == 0
+    differences = json.loads(capsys.readouterr().out)["differences"]
+    assert all(d["difference"] == d["low"] == d["high"] == 0 for one in differences.values() for d in one.values())
+
+
+def test_results_of_different_limits_are_not_compared(
+    output: Path, two_sets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    score(tmp_path, two_sets, *CONSTANT, "--max-depth", "60")
+    capsys.readouterr()
+    assert main(["evaluate", "--compare", str(output / "metrics.json"), str(tmp_path / "metrics.json")]) == 1
+    assert "max_depth=60" in capsys.readouterr().err
+
+
+def test_a_file_that_is_no_result_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "other.json").write_text('{"a": 1}')
+    assert main(["evaluate", "--compare", str(tmp_path / "other.json"), str(tmp_path / "other.json")]) == 1
+    assert "other.json: not a metrics.json" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["drive", "--compare", "a", "b"], "--compare takes two"),
+        (["--untrained"], "required: BAG"),
+        (["drive"], "is required"),
+        (["drive", "--untrained", "--min-depth", "80"], "must be below"),
+        (["drive", "--untrained", "--workers", "0"], "at least 1"),
+        (["drive", "--untrained", "--lidar", "/a", "--no-lidar"], "not allowed"),
+    ],
+)
+def test_wrong_use_is_refused_with_the_reason(arguments: list[str], text: str, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as ended:
+        main(["evaluate", *arguments])
+    assert ended.value.code == 2
+    assert text in capsys.readouterr().err
