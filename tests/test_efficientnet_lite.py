@@ -1,20 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """The EfficientNet-Lite0 encoder against another implementation of it.
 
-`efficientnet_lite0_features.npz` holds what the package `efficientnet-lite-pytorch` 0.1.0 computes with `imported_state`.
+`efficientnet_lite0_features.npz` holds what the package `efficientnet-lite-pytorch` computes with `imported_state`.
 """
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from cvcdepth_core.checkpoint import load_imagenet_encoder, load_network_state
+from cvcdepth_core.checkpoint import load_checkpoint, load_imagenet_encoder, load_network_state
 from cvcdepth_core.errors import CheckpointError
-from cvcdepth_core.networks import DepthNet, PoseNet
+from cvcdepth_core.networks import DepthNet, PoseNet, disparity_to_depth
 from cvcdepth_core.networks.efficientnet_lite import EfficientNetLite0Encoder
 
+ROOT = Path(__file__).parent.parent
 GOLDEN = Path(__file__).parent / "efficientnet_lite0_features.npz"
 
 
@@ -91,3 +95,24 @@ def test_both_networks_take_the_encoder_and_train_all_of_it():
     (disparity.square().sum() + axis_angle.sum() + translation.square().sum()).backward()
     for network in (depth_net, pose_net):
         assert not [name for name, value in network.named_parameters() if value.grad is None]
+
+
+def test_the_import_tool_makes_a_checkpoint_that_begins_at_the_initial_depth(golden, tmp_path):
+    torch.save(imported_state(golden["names"], golden["shapes"]), tmp_path / "classifier.pth")
+    tool, config = ROOT / "tools" / "imagenet_checkpoint.py", ROOT / "config" / "training" / "finetune.yaml"
+    out = tmp_path / "start.safetensors"
+    subprocess.run(
+        [sys.executable, tool, config, tmp_path / "classifier.pth", "-o", out, "--initial-depth", "5"],
+        check=True,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )
+    checkpoint = load_checkpoint(out)
+    stem = checkpoint.depth_net["depth_encoder.encoder.stem.weight"]
+    assert torch.equal(stem, imported_state(golden["names"], golden["shapes"])["_conv_stem.weight"])
+    spec = checkpoint.spec
+    disparity = torch.sigmoid(checkpoint.depth_net["depth_decoder.decoder.10.conv.bias"])
+    depth = disparity_to_depth(
+        disparity.view(1, 1, 1), torch.tensor(spec.focal_scale), spec.min_depth, spec.max_depth, spec.focal_scale
+    )
+    assert float(depth) == pytest.approx(5, rel=1e-4)
+    assert checkpoint.pose_net
