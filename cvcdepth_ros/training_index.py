@@ -89,6 +89,8 @@ def build_index(path: Location, matching: MatchingSettings, rig_layout: RigLayou
             raise RecordingError(f"{path}: no surround set: {replay.why_no_set()}")
     poses = None if motion is None else [_poses(motion, surround_set) for surround_set in sets]
     placed = [i for i in range(len(sets)) if poses is None or poses[i] is not None]
+    if not placed:
+        raise RecordingError(f"{path}: none of its {len(sets)} surround sets lies within the recorded motion")
     return RecordingIndex(
         path=path,
         layout=layout,

@@ -242,6 +242,14 @@ def test_sets_that_the_recorded_motion_does_not_reach_are_left_out(tmp_path):
     assert recording.unplaced >= 3
 
 
+def test_motion_that_reaches_no_set_is_refused_by_the_recordings_name(tmp_path):
+    entries = sample_entries(3)
+    first = next(entry for entry in entries if entry.topic == "/tf")
+    odd = [first, *without(entries, "/tf", "/odom")]
+    with pytest.raises(RecordingError, match=r"odd: none of its 3 surround sets lies within the recorded motion"):
+        build_index(write_rosbag2(tmp_path / "odd", odd), MATCHING)
+
+
 def test_a_recording_that_lost_its_messages_since_gives_no_batch(index, tmp_path):
     shorter = replace(index, path=write_rosbag2(tmp_path / "shorter", sample_entries(1)))
     assert list(RecordingBatches([shorter], config()).epoch(0)) == [None] * 8
