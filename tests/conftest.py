@@ -2,9 +2,13 @@
 """Options and fixtures shared by the tests."""
 
 from collections.abc import Iterator
+import signal
 from pathlib import Path
 
 import pytest
+
+# A shell that runs the tests in the background has them ignore SIGINT, and the programs they start would inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 from s3_server import LocalS3, local_s3
 
 

@@ -40,7 +40,7 @@ def test_every_link_to_a_file_leads_somewhere():
 def test_cvcdepth_commands_run_in_the_order_in_which_they_stand(tmp_path):
     (tmp_path / "samples").symlink_to(ROOT / "samples")
     commands = [command for command in COMMANDS if command.startswith("cvcdepth ")]
-    assert {shlex.split(command)[1] for command in commands} == {"rig", "run", "play"}
+    assert {shlex.split(command)[1] for command in commands} == {"inspect", "check", "rig", "run", "evaluate", "play"}
     environment = os.environ | {"ROS_DOMAIN_ID": "9", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     for command in commands:
         if " play " in command:
