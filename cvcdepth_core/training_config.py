@@ -87,7 +87,7 @@ class OptimizerConfig(_Section):
     max_gradient_norm: float | None = Field(default=None, gt=0)
     """Longer gradients are shortened to this."""
     average_decay: float | None = Field(default=None, gt=0, lt=1)
-    """Decay of the weights' exponential moving average per step; with it, the average is what is validated and saved."""
+    """Decay per step of the weights' moving average; with it, the average is what is validated and saved."""
     autocast: Literal["none", "bfloat16"] = "none"
     """Precision of the networks; views and losses stay in float32."""
 

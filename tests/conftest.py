@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Options and fixtures shared by the tests."""
 
-from collections.abc import Iterator
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from s3_server import LocalS3, local_s3
 
 # A shell that runs the tests in the background has them ignore SIGINT, and the programs they start would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
-from s3_server import LocalS3, local_s3
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

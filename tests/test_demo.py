@@ -18,6 +18,8 @@ import pytest
 
 pytest.importorskip("rclpy", reason="these tests need a ROS environment")
 
+from recordings import CAMERAS, JAZZY, SAMPLE
+
 from cvcdepth_core.errors import ConfigError
 from cvcdepth_core.rig import RigLayout
 from cvcdepth_ros.bags import RecordingWriter, open_recording
@@ -30,7 +32,6 @@ from cvcdepth_ros.demo.recorded_lidar import RecordedLidar
 from cvcdepth_ros.demo.result import DemoResult
 from cvcdepth_ros.messages import bag_message_factory
 from cvcdepth_ros.recorded_rig import discover_rig
-from tests.recordings import CAMERAS, JAZZY, SAMPLE
 
 NODE = "/surround_depth"
 TIMEOUT = 60.0

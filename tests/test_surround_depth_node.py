@@ -20,10 +20,9 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
 from rclpy.serialization import deserialize_message
+from recordings import CAMERAS, JAZZY, sample_entries
+from ros_graph import RosGraph, best_effort, reliable
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
-
-from tests.recordings import CAMERAS, JAZZY, sample_entries
-from tests.ros_graph import RosGraph, best_effort, reliable
 
 SMALL = {"untrained": True, "height": 96, "width": 160, "max_age": 0.0}
 FIRING_ORDER = ("back", "left", "front_left", "front", "front_right", "right")
