@@ -14,8 +14,7 @@ from cvcdepth_ros.camera_discovery import CAMERA_INFO_TYPE, COMPRESSED_IMAGE_TYP
 from cvcdepth_ros.rig_assembly import RigAssembler
 
 STATIC_TRANSFORMS = "/tf_static"
-
-_IMAGE_TYPES = (IMAGE_TYPE, COMPRESSED_IMAGE_TYPE)
+IMAGE_TYPES = (IMAGE_TYPE, COMPRESSED_IMAGE_TYPE)
 
 
 def discover_rig(recording: Recording, base_frame: str = "base_link") -> RigLayout:
@@ -78,7 +77,8 @@ def add_camera_info(assembler: RigAssembler, topic: str, message: Any) -> bool:
 
 
 def _add_first_camera_infos(assembler: RigAssembler, recording: Recording) -> None:
-    awaited = {camera.camera_info_topic for camera in assembler.layout.cameras} & recording.topics.keys()
+    recorded = {topic.name for topic in recording.topics.values() if topic.type == CAMERA_INFO_TYPE}
+    awaited = {camera.camera_info_topic for camera in assembler.layout.cameras} & recorded
     for message in recording.messages(awaited):
         if message.topic in awaited:
             add_camera_info(assembler, message.topic, recording.deserialize(message))
@@ -100,7 +100,7 @@ def _add_static_transforms(assembler: RigAssembler, recording: Recording) -> Non
 def topic_problems(recording: Recording, layout: RigLayout) -> Iterator[str]:
     """Say what is wrong with the topics that the cameras need, camera by camera."""
     for camera in layout.cameras:
-        problem = _topic_problem(recording, camera.image_topic, _IMAGE_TYPES)
+        problem = _topic_problem(recording, camera.image_topic, IMAGE_TYPES)
         if problem is None and (camera.calibration is None or camera.frame_id is None):
             problem = _topic_problem(recording, camera.camera_info_topic, (CAMERA_INFO_TYPE,))
         if problem is not None:
@@ -119,7 +119,7 @@ def _topic_problem(recording: Recording, name: str, types: Sequence[str]) -> str
 
 def _too_few(entries: Sequence[CameraEntry], recording: Recording) -> str:
     infos = [topic.name for topic in recording.topics.values() if topic.type == CAMERA_INFO_TYPE]
-    images = [topic.name for topic in recording.topics.values() if topic.type in _IMAGE_TYPES]
+    images = [topic.name for topic in recording.topics.values() if topic.type in IMAGE_TYPES]
     return (
         f"a surround rig needs two cameras, found {len(entries)}: a camera is a namespace with a camera_info and an "
         f"image topic; camera_info: {', '.join(infos) or 'none'}; images: {', '.join(images) or 'none'}"

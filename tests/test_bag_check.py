@@ -114,11 +114,31 @@ def test_a_topic_of_the_rig_file_that_is_not_recorded_fails(check, sample, rig_f
     assert "no image of left" in checks["sets"]["finding"]
 
 
+@pytest.mark.parametrize("field", ["image_topic", "camera_info_topic"])
+def test_a_topic_of_the_rig_file_that_carries_something_else_fails(field, check, rig_file: Path, tmp_path: Path):
+    rig = yaml.safe_load(rig_file.read_text())
+    left = next(camera for camera in rig["cameras"] if camera["name"] == "left")
+    left.pop("calibration")
+    left[field] = "/odom"
+    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(rig))
+    found = check(SAMPLE, "--rig", str(tmp_path / "rig.yaml"))["cameras"]
+    assert found["status"] == "failed"
+    assert "camera left: /odom carries nav_msgs/msg/Odometry" in found["finding"]
+
+
 def test_without_cameras_the_other_checks_say_so(check, sample):
     checks = check(recordings.without(sample, "/camera"))
     assert statuses(checks) == {"cameras": "failed", "LiDAR": "skipped", "stamps": "passed"} | dict.fromkeys(
         CHECKS.keys() - {"cameras", "LiDAR", "stamps"}, "skipped"
     )
+
+
+def test_a_camera_info_that_cannot_be_read_fails(check, sample):
+    first = next(i for i, entry in enumerate(sample) if entry.topic == "/camera/left/camera_info")
+    cut = [e._replace(cdr=e.cdr[:40]) if i == first else e for i, e in enumerate(sample)]
+    found = check(cut)["cameras"]
+    assert found["status"] == "failed"
+    assert "/camera/left/camera_info at" in found["finding"]
 
 
 def test_an_uncalibrated_camera_fails(check, sample):
@@ -258,8 +278,9 @@ def test_a_mask_of_another_size_fails(check, rig_file: Path, tmp_path: Path):
 def test_without_a_lidar_there_is_a_warning_and_one_that_is_named_must_be_there(check, sample, tmp_path: Path):
     path = recordings.write_rosbag2(tmp_path / "bag", recordings.without(sample, "/lidar"))
     assert check(path)["LiDAR"]["status"] == "warning"
-    found = check(path, "--lidar", "/lidar/points")["LiDAR"]
-    assert (found["status"], found["values"]["missing"]) == ("failed", ["/lidar/points"])
+    for topic in ("/lidar/points", "/odom"):
+        found = check(path, "--lidar", topic)["LiDAR"]
+        assert (found["status"], found["values"]["missing"]) == ("failed", [topic])
 
 
 def test_a_lidar_without_transform_or_without_coordinates_fails(check, sample, tmp_path: Path):
@@ -276,13 +297,11 @@ def test_a_lidar_without_transform_or_without_coordinates_fails(check, sample, t
         assert reason in found["finding"]
 
 
-def test_a_lidar_that_looks_elsewhere_fails(check, sample):
-    """Turned upside down and moved 500 m up, nothing of it is in any picture at a plausible depth."""
-
+def test_points_that_are_too_far_away_to_be_true_fail(check, sample):
     def away(message: Any) -> None:
         for link in message.transforms:
             if link.child_frame_id == "pandar64":
-                link.transform.translation.z += 500.0
+                link.transform.translation.x += 500.0  # straight ahead: all are in the front camera's picture
 
     assert check(recordings.changed(sample, "/tf_static", away))["LiDAR"]["status"] == "failed"
 

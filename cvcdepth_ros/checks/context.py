@@ -18,7 +18,7 @@ from cvcdepth_core.rig import Rig, RigLayout
 from cvcdepth_ros.bags import RecordedMessage, Recording
 from cvcdepth_ros.lidar import VehicleMotion, cloud_topics
 from cvcdepth_ros.messages import picture_from_message
-from cvcdepth_ros.recorded_rig import collect_rig, discover_layout
+from cvcdepth_ros.recorded_rig import IMAGE_TYPES, collect_rig, discover_layout
 from cvcdepth_ros.rig_assembly import RigAssembler
 from cvcdepth_ros.topic_timing import TopicTiming
 
@@ -75,8 +75,10 @@ class CheckContext:
         self.has_rig_file = rig_layout is not None
         self.contradiction: str | None = None
         """Why the recorded transforms make no tree."""
+        self.refusal: str | None = None
+        """Why the cameras make no rig at all."""
         self.assembler = self._collected(rig_layout)
-        """None where fewer than two cameras are found, or the transforms contradict each other."""
+        """None where the cameras make no rig, or the transforms contradict each other."""
         self.lidars = options.lidar if options.lidar is not None else tuple(cloud_topics(recording))
         self.motion = self._found_motion()
         self.motion_problem: str | None = None
@@ -121,8 +123,8 @@ class CheckContext:
             return collect_rig(self.recording, layout)
         except TransformError as error:
             self.contradiction = str(error)
-        except (RecordingError, RigError):
-            pass
+        except (RecordingError, RigError) as error:
+            self.refusal = str(error)
         return None
 
     def _found_motion(self) -> VehicleMotion | None:
@@ -144,8 +146,10 @@ class CheckContext:
 
     def _cameras_by_topic(self) -> dict[str, list[str]]:
         found: dict[str, list[str]] = defaultdict(list)
+        images = {topic.name for topic in self.recording.topics.values() if topic.type in IMAGE_TYPES}
         for camera in self.assembler.layout.cameras if self.assembler else ():
-            found[camera.image_topic].append(camera.name)
+            if camera.image_topic in images:
+                found[camera.image_topic].append(camera.name)
         return found
 
     def _add_stamped(self, message: RecordedMessage, cameras: Iterable[str]) -> None:

@@ -6,9 +6,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 from cvcdepth_ros.bags import Recording
-from cvcdepth_ros.camera_discovery import CAMERA_INFO_TYPE, COMPRESSED_IMAGE_TYPE, IMAGE_TYPE
+from cvcdepth_ros.camera_discovery import CAMERA_INFO_TYPE
 from cvcdepth_ros.checks.context import CheckContext, CheckResult
-from cvcdepth_ros.recorded_rig import STATIC_TRANSFORMS, recorded_cameras, topic_problems
+from cvcdepth_ros.recorded_rig import IMAGE_TYPES, STATIC_TRANSFORMS, recorded_cameras, topic_problems
 from cvcdepth_ros.transforms import frame_name
 
 _INFO = "camera_info"
@@ -29,9 +29,10 @@ def check_cameras(context: CheckContext) -> CheckResult:
     if values["without_images"]:
         remedy = "record its images, or give a rig file without this camera (--rig)"
         return CheckResult("failed", f"{found}; no image beside {', '.join(values['without_images'])}", remedy, values)
-    if len(names) < 2:
+    if context.refusal is not None:
         remedy = "record a camera_info beside the images of at least two cameras, in one namespace each"
-        return CheckResult("failed", f"{found}, two are needed", remedy, values)
+        reason = "two are needed" if len(names) < 2 else context.refusal
+        return CheckResult("failed", f"{found}; {reason}", remedy, values)
     if values["without_camera_info"]:
         remedy = "record its camera_info, or give its calibration in a rig file (--rig)"
         finding = f"{found}; no camera_info beside {', '.join(values['without_camera_info'])}"
@@ -119,7 +120,7 @@ def _unknown(recording: Recording) -> Iterator[str]:
     """Give the image topics beside which no camera_info was recorded."""
     known = tuple(camera.camera_info_topic.removesuffix(_INFO) for camera in recorded_cameras(recording))
     for topic in recording.topics.values():
-        is_picture = topic.type in (IMAGE_TYPE, COMPRESSED_IMAGE_TYPE) and not _is_of_depth(topic.name)
+        is_picture = topic.type in IMAGE_TYPES and not _is_of_depth(topic.name)
         if is_picture and topic.count and not topic.name.startswith(known):
             yield topic.name
 

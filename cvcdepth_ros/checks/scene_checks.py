@@ -11,7 +11,7 @@ from cvcdepth_core.ground_truth import PinholeView
 from cvcdepth_core.preprocess import Rectifier, self_occlusion_mask
 from cvcdepth_core.rig import Camera, Rig
 from cvcdepth_ros.checks.context import CheckContext, CheckResult, Status
-from cvcdepth_ros.lidar import LidarSweeps
+from cvcdepth_ros.lidar import LidarSweeps, cloud_topics
 from cvcdepth_ros.messages import stamp_ns
 from cvcdepth_ros.synchronizer import NANOSECONDS
 from cvcdepth_ros.transforms import TransformTree
@@ -73,9 +73,10 @@ def _masked_shares(camera: Camera) -> tuple[float, float]:
 
 def check_lidar(context: CheckContext) -> CheckResult:
     """Project a sweep of each LiDAR into every camera at the moment of its nearest image."""
-    missing = [topic for topic in context.lidars if topic not in context.sweeps]
+    clouds = cloud_topics(context.recording)
+    missing = [topic for topic in context.lidars if topic not in clouds or topic not in context.sweeps]
     if missing:
-        remedy = "name a recorded topic of point clouds; `bag_replay inspect` lists them"
+        remedy = f"name a topic with point clouds; there are {', '.join(clouds) or 'none'}"
         return CheckResult("failed", f"no sweep on {', '.join(missing)}", remedy, {"missing": missing})
     if not context.lidars:
         remedy = "without a LiDAR, `evaluate` gives the label-free scores only"
