@@ -117,6 +117,20 @@ def test_a_damaged_chunk_shows_since_every_message_is_read(sample: list[Entry], 
     assert f"chunk at byte {chunk.start} skipped" in capsys.readouterr().out
 
 
+def test_the_text_tells_what_is_wrong_below_its_table(sample: list[Entry], tmp_path: Path, capsys):
+    def uncalibrate(message: Any) -> None:
+        message.k = np.zeros(9)
+
+    swapped = recordings.restamped(sample, FRONT, lambda n, stamp: stamp + {4: 100 * MS, 5: -100 * MS}.get(n, 0))
+    path = recordings.write_rosbag2(
+        tmp_path / "bag", recordings.changed(swapped, "/camera/left/camera_info", uncalibrate)
+    )
+    assert main(["inspect", str(path)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert f"  {FRONT}: 1 of 10 stamps step back" in lines
+    assert "  camera left: camera_info: K[0] = 0: the camera is not calibrated" in lines
+
+
 def test_the_text_has_a_line_for_every_topic_and_camera(capsys: pytest.CaptureFixture[str]):
     assert main(["inspect", str(SAMPLE)]) == 0
     lines = capsys.readouterr().out.splitlines()

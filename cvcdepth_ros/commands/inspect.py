@@ -2,7 +2,7 @@
 """`inspect`: tell what is in recordings."""
 
 import argparse
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 from datetime import datetime, timezone
 from typing import TYPE_CHECKING, Any
@@ -22,7 +22,7 @@ from cvcdepth_ros.commands.arguments import (
 
 if TYPE_CHECKING:
     from cvcdepth_ros.bags import Location
-    from cvcdepth_ros.recording_summary import CameraSummary, RecordingSummary, TopicSummary
+    from cvcdepth_ros.recording_summary import CameraSummary, IndexState, RecordingSummary, TopicSummary
 
 SUMMARY = """Tell what is in recordings: topics, rates, gaps, clocks, cameras, damage.
 
@@ -34,6 +34,8 @@ EXAMPLES: tuple[str, ...] = (
     "inspect drives/ 'archive/*/*.db3' --json",
     "inspect s3://fleet/2026/drive.mcap --start 60 --duration 5",
 )
+
+_TRANSFORMS = "/tf"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -95,14 +97,14 @@ def _headline(summary: "RecordingSummary") -> str:
     return (
         f"{summary.path}\n"
         f"  {begin:%Y-%m-%d %H:%M:%S} UTC, {_seconds(summary.seconds)}, {messages} messages, {_bytes(size)}"
-        f"{f' in {files} files' if files > 1 else ''}; index {_INDEX[summary.index]}"
+        f"{f' in {files} files' if files > 1 else ''}; {_INDEX[summary.index]}"
     )
 
 
-_INDEX = {
-    "intact": "intact",
-    "rebuilt": "missing: it was rebuilt by reading the file through",
-    "damaged": "or content damaged:",
+_INDEX: dict["IndexState", str] = {
+    "intact": "index intact",
+    "rebuilt": "no index, rebuilt by reading the file through",
+    "damaged": "damaged:",
 }
 
 
@@ -113,7 +115,16 @@ def _damage(summary: "RecordingSummary") -> Iterable[str]:
 def _topics(topics: Sequence["TopicSummary"]) -> str:
     header = ("topic", "type", "messages", "Hz", "gap ms", "gaps", "jitter ms", "clock ms", "size")
     rows = [_topic_row(topic) for topic in topics]
-    return table(header, rows, numbers=range(2, len(header)))
+    return "\n".join([table(header, rows, numbers=range(2, len(header))), *_odd_stamps(topics)])
+
+
+def _odd_stamps(topics: Sequence["TopicSummary"]) -> Iterator[str]:
+    for topic in topics:
+        timing = topic.timing
+        for count, what in ((timing.steps_back, "step back"), (timing.repeated, "repeat")):
+            # One message of /tf tells the transforms of one sender; those of several need not ascend.
+            if count and topic.name != _TRANSFORMS:
+                yield f"  {topic.name}: {count} of {timing.messages} stamps {what}"
 
 
 def _topic_row(topic: "TopicSummary") -> tuple[str, ...]:
@@ -136,13 +147,15 @@ def _topic_row(topic: "TopicSummary") -> tuple[str, ...]:
 def _cameras(cameras: Sequence["CameraSummary"]) -> str:
     if not cameras:
         return "no cameras: a camera is a namespace with a camera_info and an image topic"
-    return table(("camera", "size", "distortion", "frame", "images"), [_camera_row(camera) for camera in cameras])
+    rows = [_camera_row(camera) for camera in cameras]
+    problems = [f"  {camera.problem}" for camera in cameras if camera.problem]
+    return "\n".join([table(("camera", "size", "distortion", "frame", "images"), rows), *problems])
 
 
 def _camera_row(camera: "CameraSummary") -> tuple[str, ...]:
     calibration = camera.calibration
     if calibration is None:
-        size, distortion = "?", camera.problem or ""
+        size, distortion = "?", "?"
     else:
         size = "{}x{}".format(*calibration.image_size)
         distortion = calibration.distortion_model if any(calibration.d) else "none"
