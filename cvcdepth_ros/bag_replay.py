@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Work with recordings of surround cameras: describe their rig, compute and score depth, play them live."""
+"""Work with recordings of surround cameras: describe their rig, compute and score depth, train, play them live."""
 
 import argparse
 import os
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from cvcdepth_core.errors import CvcDepthError
-from cvcdepth_ros.commands import check, evaluate, inspect, play, rig, run
+from cvcdepth_ros.commands import check, evaluate, finetune, inspect, play, rig, run
 from cvcdepth_ros.version import package_version
 
 
@@ -34,6 +34,7 @@ COMMANDS: Mapping[str, Command] = {
     "rig": rig,
     "run": run,
     "evaluate": evaluate,
+    "finetune": finetune,
     "play": play,
 }
 

@@ -10,9 +10,7 @@ from recordings import SAMPLE
 
 from cvcdepth_core.checkpoint import load_checkpoint
 from cvcdepth_core.training_config import load_training_config
-from cvcdepth_ros import bag_replay
 from cvcdepth_ros.bag_replay import main
-from cvcdepth_ros.commands import finetune as finetune_command
 
 SMALL = {
     "dataset": "recording",
@@ -21,11 +19,6 @@ SMALL = {
     "recordings": {"held_out": 0.3, "min_travel": 0.1},
     "optimizer": {"epochs": 1, "samples_per_step": 2},
 }
-
-
-@pytest.fixture(autouse=True)
-def _registered(monkeypatch):
-    monkeypatch.setitem(bag_replay.COMMANDS, "finetune", finetune_command)
 
 
 @pytest.fixture
