@@ -260,25 +260,48 @@ def test_flat_ground_agrees_with_itself_far_better_than_a_wall_around_every_came
 # What is written
 
 
-def test_metrics_json_has_exactly_the_fields_that_the_documentation_names(output: Path):
-    text = (ROOT / "docs" / "evaluation.md").read_text()
-    documented = set(re.findall(r"^\| `([^`]+)` \|", text.split("### metrics.json")[1].split("###")[0], re.MULTILINE))
-    assert documented == set(fields(metrics_of(output)))
+DOCUMENTATION = (ROOT / "docs" / "evaluation.md").read_text(encoding="utf-8")
+NAMES_VARY = re.compile(
+    r"scores(\.\*)?|scores\.\*\.\*\.(mean|cameras)(\.\*)*|label_free\.rank_correlation_with_abs_rel"
+)
+
+
+def documented(heading: str) -> set[str]:
+    """The names in the first column of the table below a heading."""
+    section = DOCUMENTATION.split(f"# {heading}\n")[1].split("\n#")[0]
+    return set(re.findall(r"^\| `([^`]+)` \|", section, re.MULTILINE))
 
 
 def fields(value: Any, path: str = "") -> Iterator[str]:
-    """Name the leaves as the documentation does: `*` for a name that varies, `[]` for list items."""
-    varies = {"cameras": "*", "mean": "*", "image": "*", "pool": "*", "image.*.cameras.*": "*"}
-    if path in ("configuration", "rows"):
-        yield path
-    elif isinstance(value, dict) and value:
+    """Name the leaves as the documentation does: `*` for a name that varies, `[]` for the items of a list."""
+    if isinstance(value, dict) and path not in ("configuration", "rows"):
         for name, child in value.items():
-            star = any(path.endswith(end) for end in varies) or re.search(r"cameras\.\*$", path) or path == "scores"
-            yield from fields(child, f"{path}.{'*' if star else name}".lstrip("."))
+            yield from fields(child, f"{path}.{'*' if NAMES_VARY.fullmatch(path) else name}".removeprefix("."))
     elif isinstance(value, list) and value and isinstance(value[0], dict):
         yield from fields(value[0], f"{path}[]")
     else:
         yield path
+
+
+def test_metrics_json_has_exactly_the_fields_that_the_documentation_names(in_turn: Path):
+    result = metrics_of(in_turn)
+    assert documented("metrics.json") == set(fields(result))
+    image = result["scores"]["image"]
+    assert (
+        documented("Scores")
+        == image["metric"]["mean"]["all"].keys()
+        == image["median"]["cameras"]["left"]["all"].keys()
+    )
+    assert documented("Groups of pixels") == image["metric"]["mean"].keys()
+    assert documented("Label-free scores") == result["label_free"]["rank_correlation_with_abs_rel"].keys()
+    assert result["scores"].keys() == {"image", "pool"}
+
+
+def test_per_frame_csv_has_exactly_the_columns_that_the_documentation_names(output: Path):
+    columns = next(iter(frames_of(output).values())).keys()
+    scores = documented("Scores") - {"coverage", "truth_points", "measurements"}
+    named = documented("per_frame.csv") | scores | {f"{name}_median_scaled" for name in scores}
+    assert columns == named | documented("Label-free scores")
 
 
 def test_every_image_has_a_line(output: Path):

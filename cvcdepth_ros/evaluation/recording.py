@@ -20,6 +20,7 @@ from cvcdepth_core.visualization import Points
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.evaluation.job import EvaluationJob
 from cvcdepth_ros.evaluation.recorded_truth import RecordedTruth
+from cvcdepth_ros.latencies import StageLatencies
 from cvcdepth_ros.recorded_rig import discover_rig
 from cvcdepth_ros.replay import DepthReplay, EstimatedSet, SurroundReplay
 from cvcdepth_ros.synchronizer import NANOSECONDS
@@ -131,12 +132,30 @@ class RecordingEvaluation:
         self.truth.read(stop, stop + ahead)
         yield from map(self._measured, pending)
 
+    def scores(self, progress: Progress | None = None) -> RecordingScores:
+        """Score every set of the job's part. Raises RecordingError, saying why, when there is none."""
+        start, stop = self.window
+        scoring = _Scoring(self.job, self.replay.rig.names, self.latencies)
+        for measured in self.sets(start, stop):
+            scoring.add(measured)
+            if progress is not None:
+                progress(min(1.0, (measured.log_time - start) / (stop - start)))
+        if not scoring.log_times:
+            raise RecordingError(f"{self.job.path}: no set: {_why_nothing(self)}")
+        return scoring.result(_summary(self, scoring))
+
+    @property
+    def latencies(self) -> StageLatencies:
+        """Where the time went."""
+        return self.depths.latencies
+
     def _measured(self, estimated: EstimatedSet) -> MeasuredSet:
         images, rig = estimated.images, estimated.rig
-        truth = self.truth.camera_depth(rig, images.stamps_ns, self.job.settings.occlusion)
-        poses = self.truth.base_poses(rig, images.stamps_ns)
-        lidar = self.truth.points(images.stamp_ns)
-        self.truth.forget_before(min(images.stamps_ns.values()))
+        with self.latencies.measure("truth"):
+            truth = self.truth.camera_depth(rig, images.stamps_ns, self.job.settings.occlusion)
+            poses = self.truth.base_poses(rig, images.stamps_ns)
+            lidar = self.truth.points(images.stamp_ns)
+            self.truth.forget_before(min(images.stamps_ns.values()))
         return MeasuredSet(estimated, truth, poses, lidar)
 
 
@@ -159,15 +178,7 @@ def open_evaluation(job: EvaluationJob) -> Iterator[RecordingEvaluation]:
 def evaluate_recording(job: EvaluationJob, progress: Progress | None = None) -> RecordingScores:
     """Score every set of a recording. Raises RecordingError, saying why, when there is none."""
     with open_evaluation(job) as evaluation:
-        start, stop = evaluation.window
-        scoring = _Scoring(job, evaluation.replay.rig.names)
-        for measured in evaluation.sets(start, stop):
-            scoring.add(measured)
-            if progress is not None:
-                progress(min(1.0, (measured.log_time - start) / (stop - start)))
-        if not scoring.log_times:
-            raise RecordingError(f"{job.path}: no set: {_why_nothing(evaluation)}")
-        return scoring.result(_summary(evaluation, scoring))
+        return evaluation.scores(progress)
 
 
 def measured_set(job: EvaluationJob, stamp_ns: int, log_time: int) -> MeasuredSet:
@@ -182,8 +193,9 @@ def measured_set(job: EvaluationJob, stamp_ns: int, log_time: int) -> MeasuredSe
 class _Scoring:
     """Adds up one recording's sets."""
 
-    def __init__(self, job: EvaluationJob, cameras: Sequence[str]) -> None:
+    def __init__(self, job: EvaluationJob, cameras: Sequence[str], latencies: StageLatencies) -> None:
         self._job = job
+        self._latencies = latencies
         self._scorer = SurroundScorer(job.name, cameras, job.settings.scores)
         self._agreement: list[AgreementRow] = []
         self._earlier: tuple[int, PosedDepth] | None = None
@@ -193,12 +205,14 @@ class _Scoring:
 
     def add(self, measured: MeasuredSet) -> None:
         """Score one set; sets come in order."""
-        rows = self._scorer.add(measured.stamp_ns, measured.samples())
+        with self._latencies.measure("score"):
+            rows = self._scorer.add(measured.stamp_ns, measured.samples())
         points = sum(row.sums["metric"]["all"].truth for row in rows if "all" in row.sums["metric"])
         self.truth_points += points
         self.sets_with_truth += points > 0
         self.log_times[measured.stamp_ns] = measured.log_time
-        self._compare(measured)
+        with self._latencies.measure("label-free"), torch.inference_mode():
+            self._compare(measured)
 
     def result(self, summary: dict[str, Any]) -> RecordingScores:
         """Return what was found."""
