@@ -5,6 +5,7 @@ import csv
 import hashlib
 import json
 import math
+import os
 import re
 import shutil
 from collections.abc import Iterator
@@ -19,6 +20,7 @@ import torch
 from numpy.typing import NDArray
 from recordings import CAMERAS, SAMPLE, SAMPLE_MCAP
 from rosbags.highlevel import AnyReader
+from s3_server import LocalS3
 
 from cvcdepth_core.checkpoint import DepthModelSpec, save_checkpoint
 from cvcdepth_core.networks import DepthNet
@@ -26,7 +28,9 @@ from cvcdepth_core.reference_predictors import FixedDepth
 from cvcdepth_ros.bag_replay import main
 from cvcdepth_ros.commands import evaluate
 from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings
-from cvcdepth_ros.evaluation.recording import open_evaluation
+from cvcdepth_ros.evaluation.recording import RecordingScores, open_evaluation
+from cvcdepth_ros.evaluation.result import Failure
+from cvcdepth_ros.evaluation.workers import evaluate_all
 from cvcdepth_ros.replay import DepthReplay
 
 ROOT = Path(__file__).parent.parent
@@ -425,6 +429,24 @@ def test_the_program_fails_only_when_nothing_could_be_evaluated(
     assert not (tmp_path / "out").exists()
 
 
+class DeadlyJob(EvaluationJob):
+    """Whoever receives it dies at once, as a process does that the kernel kills for want of memory."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os._exit, (9,)
+
+
+def test_a_worker_that_dies_costs_its_own_recording_only(two_sets: Path):
+    settings = EvaluationSettings(predictor="constant", height=64, width=96)
+    jobs = [cls(cls.__name__, str(two_sets), settings) for cls in (DeadlyJob, EvaluationJob)]
+    found = {job.name: outcome for job, outcome in evaluate_all(jobs, workers=2)}
+    failure, scores = found["DeadlyJob"], found["EvaluationJob"]
+    assert isinstance(failure, Failure)
+    assert "died" in failure.reason
+    assert isinstance(scores, RecordingScores)
+    assert scores.summary["sets"]["scored"] == 2
+
+
 def test_a_lidar_topic_that_is_not_there_is_named(two_sets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     arguments = ["evaluate", str(two_sets), "-o", str(tmp_path / "out"), *CONSTANT, "--lidar", "/roof"]
     assert main(arguments) == 1
@@ -455,6 +477,33 @@ def test_finished_recordings_are_not_done_again(two_sets: Path, tmp_path: Path):
     assert not was_kept()
     part.write_text(part.read_text()[:1000])
     assert score(out, recording, *CONSTANT) == first
+
+
+def test_a_recording_in_a_bucket_scores_as_the_file_does_and_is_not_read_whole(
+    output: Path, s3: LocalS3, tmp_path: Path
+):
+    drive = recordings.write_mcap(tmp_path / "drive.mcap", long_drive())
+    url = s3.put(drive, "drive.mcap")
+    window = (*CONSTANT, "--no-occlusion-filter", "--start", "0.3", "--duration", "0.2")
+    score(tmp_path / "out", url, *window)
+    sent = s3.sent
+    assert 0 < sent < drive.stat().st_size
+    whole = {key[1:]: row["abs_rel"] for key, row in frames_of(output).items()}
+    part = {key[1:]: row["abs_rel"] for key, row in frames_of(tmp_path / "out").items()}
+    assert len(part) in (6, 12)
+    assert part.items() <= whole.items()
+    score(tmp_path / "out", url, *window)
+    assert s3.sent == sent
+
+
+def long_drive() -> Iterator[recordings.Entry]:
+    """The sample, and its images twice more, a second later each."""
+    entries = recordings.sample_entries()
+    yield from entries
+    for seconds_later in (1, 2):
+        for entry in entries:
+            if "Image" in entry.type:
+                yield entry._replace(log_time=entry.log_time + seconds_later * 10**9)
 
 
 # Comparison

@@ -17,6 +17,9 @@ from cvcdepth_ros.lidar import CLOUD_TYPE, LidarSweeps, VehicleMotion, cloud_top
 from cvcdepth_ros.replay import Refusals, SurroundReplay
 from cvcdepth_ros.synchronizer import NANOSECONDS
 
+_LATE_NS = 300_000_000
+"""By how much later than its stamp a sweep or a pose is recorded, at most."""
+
 
 class RecordedTruth:
     """What a recording knows of depth beside its pictures.
@@ -36,7 +39,7 @@ class RecordedTruth:
         """Sweeps and moments that are no use, and why."""
         self._sweeps = LidarSweeps(self.topics, base_frame, replay.transforms, self.motion, tolerance)
         self._tolerance_ns = round(tolerance * NANOSECONDS)
-        self.ahead_ns = self._tolerance_ns + NANOSECONDS // 2  # a sweep is recorded after its stamp
+        self.ahead_ns = self._tolerance_ns + _LATE_NS
         self.handlers: Mapping[str, Callable[[RecordedMessage], None]] = {
             **dict.fromkeys(self.topics, self._add_sweep),
             **({self.motion.topic: self._add_motion} if self.motion else {}),
