@@ -189,6 +189,13 @@ class DepthReplay:
             else:
                 yield EstimatedSet(images, surround.rig, depth)
 
+    def why_no_set(self, start: int | None = None, stop: int | None = None) -> str:
+        """Explain why `sets` gave none: what was refused, else what `SurroundReplay.why_no_set` says."""
+        for refusals in (self.refused, self._replay.unreadable):
+            if refusals.count:
+                return f"{refusals.count} refused, the first: {refusals.reasons[0]}"
+        return self._replay.why_no_set(start, stop)
+
     def _current_surround(self) -> SurroundDepthEstimator:
         if self._surround.rig is not self._replay.rig:
             self._surround = SurroundDepthEstimator(self._replay.rig, self.estimator)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from cvcdepth_core.errors import ImageError, RecordingError, RigError, TransformError
 from cvcdepth_core.rig import RigLayout
-from cvcdepth_ros.bags import Location, RecordedMessage, Recording, open_recording
+from cvcdepth_ros.bags import Location, RecordedMessage, Recording, file_identities, open_recording
 from cvcdepth_ros.camera_discovery import CAMERA_INFO_TYPE
 from cvcdepth_ros.lidar import VehicleMotion
 from cvcdepth_ros.messages import picture_from_message
@@ -187,18 +187,11 @@ def _key(path: Location, matching: MatchingSettings, layout: RigLayout | None) -
     return json.dumps(
         {
             "format": _FORMAT,
-            "files": _file_identities(Path(str(path))),
+            "files": file_identities(path),
             "matching": matching.model_dump(),
             "rig": None if layout is None else layout.model_dump(mode="json"),
         }
     )
-
-
-def _file_identities(path: Path) -> list[list[str | int]]:
-    """Return name, size and modification time (ns) of the recording's files; nothing for one behind a URL."""
-    files = sorted(path.iterdir()) if path.is_dir() else [path]
-    statuses = [(file.name, file.stat()) for file in files if file.is_file()]
-    return [[name, status.st_size, status.st_mtime_ns] for name, status in statuses]
 
 
 def _write(cached: Path, index: RecordingIndex, key: str) -> None:

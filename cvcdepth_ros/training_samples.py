@@ -339,6 +339,8 @@ def _loader(reader: SampleReader, order: _EpochOrder, workers: int) -> DataLoade
         batch_sampler=order,
         num_workers=workers,
         persistent_workers=workers > 0,
+        # A forked worker inherits locks that a thread of OpenCV, torch or fsspec may hold, and then waits for ever.
+        multiprocessing_context="spawn" if workers else None,
         collate_fn=partial(_collate, reader.rigs),
         worker_init_fn=_one_thread,
     )

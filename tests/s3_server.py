@@ -56,6 +56,8 @@ def local_s3() -> Iterator[LocalS3]:
         fsspec.filesystem("s3").clear_instance_cache()
         fsspec.filesystem("s3").mkdir(BUCKET)
         yield state
+        # moto keeps its buckets for the whole process, so the next server would find this one's.
+        fsspec.filesystem("s3").rm(BUCKET, recursive=True)
         fsspec.filesystem("s3").clear_instance_cache()
     server.shutdown()
     thread.join()

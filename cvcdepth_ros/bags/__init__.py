@@ -3,7 +3,7 @@
 
 from cvcdepth_ros.bags.discovery import find_recordings
 from cvcdepth_ros.bags.recording import Recording, open_recording
-from cvcdepth_ros.bags.remote import Location, RemotePath
+from cvcdepth_ros.bags.remote import Location, RemotePath, file_identities
 from cvcdepth_ros.bags.topics import LATCHED, RecordedMessage, Topic, qos_profile
 from cvcdepth_ros.bags.typestores import typestore
 from cvcdepth_ros.bags.writer import RecordingWriter
@@ -16,6 +16,7 @@ __all__ = [
     "RecordingWriter",
     "RemotePath",
     "Topic",
+    "file_identities",
     "find_recordings",
     "open_recording",
     "qos_profile",

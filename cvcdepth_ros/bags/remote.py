@@ -145,6 +145,19 @@ def location(path: str | Location) -> Location:
     return RemotePath(path) if "://" in path else Path(path)
 
 
+def file_identities(path: str | Location) -> list[list[str | int]]:
+    """Tell the versions of a file, or of all files of a folder: name, size and time of change (ns).
+
+    Of a URL it is what the storage tells instead (S3: the ETag). Raises OSError when it cannot be reached.
+    """
+    place = location(path)
+    if isinstance(place, RemotePath):
+        return [[str(file), *file.version()] for file in place.files()]
+    files = sorted(file for file in place.rglob("*") if file.is_file()) if place.is_dir() else [place]
+    statuses = [(file, file.stat()) for file in files]
+    return [[str(file), status.st_size, status.st_mtime_ns] for file, status in statuses]
+
+
 @contextmanager
 def _errors_of(path: RemotePath) -> Iterator[None]:
     try:

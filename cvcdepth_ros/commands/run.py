@@ -126,7 +126,7 @@ def _record(
                 break
     if not written and not stop.is_set():
         shutil.rmtree(arguments.output)
-        raise RecordingError(f"{replay.recording.path}: no set: {_why_nothing(replay, depths, window)}")
+        raise RecordingError(f"{replay.recording.path}: no set: {depths.why_no_set(*window)}")
     return _outcome(replay, depths, written, time.monotonic() - began) | {"interrupted": stop.is_set()}
 
 
@@ -160,13 +160,6 @@ def _stoppable() -> "Iterator[threading.Event]":
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _why_nothing(replay: "SurroundReplay", depths: "DepthReplay", window: tuple[int, int | None]) -> str:
-    for refusals in (depths.refused, replay.unreadable):
-        if refusals.count:
-            return f"{refusals.count} refused, the first: {refusals.reasons[0]}"
-    return replay.why_no_set(*window)
 
 
 def _outcome(replay: "SurroundReplay", depths: "DepthReplay", written: int, seconds: float) -> dict[str, Any]:

@@ -141,7 +141,7 @@ class RecordingEvaluation:
             if progress is not None:
                 progress(min(1.0, (measured.log_time - start) / (stop - start)))
         if not scoring.log_times:
-            raise RecordingError(f"{self.job.path}: no set: {_why_nothing(self)}")
+            raise RecordingError(f"{self.job.path}: no set: {self.depths.why_no_set(*self.window)}")
         return scoring.result(_summary(self, scoring))
 
     @property
@@ -254,13 +254,6 @@ def _summary(evaluation: RecordingEvaluation, scoring: _Scoring) -> dict[str, An
         "truth_refused": {"count": truth.refused.count, "reasons": truth.refused.reasons[:10]},
         "damage": recording.damage,
     }
-
-
-def _why_nothing(evaluation: RecordingEvaluation) -> str:
-    for refusals in (evaluation.depths.refused, evaluation.replay.unreadable):
-        if refusals.count:
-            return f"{refusals.count} refused, the first: {refusals.reasons[0]}"
-    return evaluation.replay.why_no_set(*evaluation.window)
 
 
 def _log_time(estimated: EstimatedSet) -> int:

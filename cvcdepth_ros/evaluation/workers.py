@@ -15,8 +15,7 @@ from typing import Any
 
 from cvcdepth_core.checkpoint import write_atomically
 from cvcdepth_core.errors import CvcDepthError
-from cvcdepth_ros.bags import RemotePath
-from cvcdepth_ros.bags.remote import location
+from cvcdepth_ros.bags import file_identities
 from cvcdepth_ros.evaluation.job import EvaluationJob
 from cvcdepth_ros.evaluation.recording import Progress, RecordingScores, evaluate_recording
 from cvcdepth_ros.evaluation.result import Failure
@@ -63,29 +62,6 @@ class KeptParts:
             "path": job.path,
             "files": [identity for path in (job.path, *masks) for identity in file_identities(path)],
         }
-
-
-def file_identities(path: str) -> list[list[str | int]]:
-    """Tell the versions of a file, or of all files of a folder: size and time of change (ns).
-
-    Of a URL it is what the storage tells instead (S3: the ETag). Raises OSError when it cannot be reached.
-    """
-    place = location(path)
-    if isinstance(place, RemotePath):
-        return [[str(file), _remote_version(file)] for file in place.files()]
-    files = sorted(file for file in place.rglob("*") if file.is_file()) if place.is_dir() else [place]
-    statuses = [(file, file.stat()) for file in files]
-    return [[str(file), status.st_size, status.st_mtime_ns] for file, status in statuses]
-
-
-def _remote_version(file: RemotePath) -> str:
-    from fsspec.core import url_to_fs
-
-    try:
-        storage, path = url_to_fs(str(file))
-        return str(storage.checksum(path))
-    except Exception as error:  # each storage's library has its own
-        raise OSError(f"{file}: {type(error).__name__}: {error}") from error
 
 
 def evaluate_all(
