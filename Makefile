@@ -35,12 +35,12 @@ lint: $(DEV) ## ruff and mypy
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
 
-test-ros: $(DEV) tf2_msgs ## the tests, with ROS 2 from wheels
-	.venv/bin/python -m pytest
+test-ros: $(DEV) tf2_msgs ## the tests in tests/ros, with ROS 2 from wheels
+	.venv/bin/python -m pytest tests/ros
 
-test-core: $(CORE) ## the tests that need no ROS, where there is none
+test-core: $(CORE) ## all other tests, in an environment without ROS
 	@if .venv-core/bin/python -c 'import rclpy' 2>/dev/null; then echo "rclpy is in .venv-core: make clean"; exit 1; fi
-	.venv-core/bin/python -m pytest
+	.venv-core/bin/python -m pytest --ignore tests/ros
 
 tf2_msgs: $(DEV) ## build tf2_msgs, which has no wheel, for the tests of /tf_static (needs g++)
 	@test -e $(TF2) || .venv/bin/python tests/tf2_msgs/build.py $(TF2)

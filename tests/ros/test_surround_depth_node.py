@@ -26,7 +26,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 SMALL = {"untrained": True, "height": 96, "width": 160, "max_age": 0.0}
 FIRING_ORDER = ("back", "left", "front_left", "front", "front_right", "right")
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture

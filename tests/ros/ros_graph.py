@@ -23,7 +23,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-PROFILE = Path(__file__).parent.parent / "config" / "fastdds_large_shm.xml"
+PROFILE = Path(__file__).parents[2] / "config" / "fastdds_large_shm.xml"
 TIMEOUT = 60.0
 
 _domains = itertools.count(10 + os.getpid() % 80)

@@ -24,7 +24,7 @@ from cvcdepth_ros.bags import RecordingWriter
 
 pytest.importorskip("rclpy", reason="no ROS in this environment")
 
-PROFILE = Path(__file__).parent.parent / "config" / "fastdds_large_shm.xml"
+PROFILE = Path(__file__).parents[2] / "config" / "fastdds_large_shm.xml"
 STRING = "std_msgs/msg/String"
 
 # Subscribes the topics given as {topic: [type, reliable, latched]} and prints, after a line on its standard input, how
