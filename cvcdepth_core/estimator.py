@@ -28,6 +28,8 @@ class SurroundDepth:
     """[N, H, W, 3] RGB, rectified: pixel by pixel what `depth` describes."""
     intrinsics: NDArray[np.float64]
     """[N, 3, 3] of those pictures, pixel centres at the integers."""
+    present: NDArray[np.bool_]
+    """[N] which cameras gave a picture; the others' depth is NaN and their picture black."""
 
 
 class PictureSize(Protocol):
@@ -112,15 +114,25 @@ class SurroundDepthEstimator:
         """Take the picture of the camera with this index in the rig to the network's view of it."""
         return self.preprocessor.rectify(index, picture)
 
-    def estimate(self, rectified: Sequence[Picture]) -> SurroundDepth:
-        """Estimate one set from its rectified pictures [H, W, 3], in the rig's order."""
-        intrinsics = self.preprocessor.intrinsics
-        depth = self.estimator.estimate(rectified, intrinsics[:, 0, 0])
-        return SurroundDepth(
-            depth=np.where(self.preprocessor.valid, depth, np.float32(np.nan)),
-            pictures=np.stack(rectified),
+    def estimate(self, rectified: Sequence[Picture | None]) -> SurroundDepth:
+        """Estimate one set from its rectified pictures [H, W, 3] in the rig's order, None where none is wanted.
+
+        The predictor gets only the pictures that are there.
+        """
+        cameras = [index for index, picture in enumerate(rectified) if picture is not None]
+        pictures = [picture for picture in rectified if picture is not None]
+        valid, intrinsics = self.preprocessor.valid, self.preprocessor.intrinsics
+        surround = SurroundDepth(
+            depth=np.full(valid.shape, np.nan, dtype=np.float32),
+            pictures=np.zeros((*valid.shape, 3), dtype=np.uint8),
             intrinsics=intrinsics,
+            present=np.isin(np.arange(len(valid)), cameras),
         )
+        estimated = self.estimator.estimate(pictures, intrinsics[cameras, 0, 0]) if pictures else ()
+        for index, picture, depth in zip(cameras, pictures, estimated, strict=True):
+            np.copyto(surround.depth[index], depth, where=valid[index])
+            surround.pictures[index] = picture
+        return surround
 
 
 def resolve_device(name: str) -> torch.device:

@@ -3,6 +3,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -68,12 +69,12 @@ def seen(world_T_base: np.ndarray | None = None, post: bool = True) -> PosedDept
     """What the rig sees from a place, with the right depth and the right poses."""
     poses = [(np.eye(4) if world_T_base is None else world_T_base) @ camera.base_T_camera for camera in RIG.cameras]
     depth, pictures = map(np.stack, zip(*(cast(pose, post) for pose in poses), strict=True))
-    surround = SurroundDepth(depth, pictures, np.stack([K, K]))
+    surround = SurroundDepth(depth, pictures, np.stack([K, K]), np.ones(2, bool))
     return PosedDepth.of(surround, RIG, None if world_T_base is None else [world_T_base] * 2)
 
 
 def with_depth(posed: PosedDepth, depth: np.ndarray) -> PosedDepth:
-    surround = SurroundDepth(depth.astype(np.float32), posed.surround.pictures, posed.surround.intrinsics)
+    surround = replace(posed.surround, depth=depth.astype(np.float32))
     return PosedDepth(surround, posed.world_T_camera)
 
 
@@ -190,6 +191,7 @@ def test_the_vehicles_motion_between_two_exposures_is_taken_into_account():
         np.stack([first.surround.depth[0], second.surround.depth[1]]),
         np.stack([first.surround.pictures[0], second.surround.pictures[1]]),
         first.surround.intrinsics,
+        np.ones(2, bool),
     )
     known = PosedDepth.of(surround, RIG, [np.eye(4), moved])
     unknown = PosedDepth.of(surround, RIG, None)
