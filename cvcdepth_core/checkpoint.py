@@ -7,7 +7,6 @@ Nothing executes on loading, and a key that does not fit is an error, never skip
 from __future__ import annotations
 
 import hashlib
-import os
 import pickle
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -19,6 +18,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
+from cvcdepth_core.atomic_file import write_atomically
 from cvcdepth_core.errors import CheckpointError
 from cvcdepth_core.networks import ENCODERS, INPUT_STRIDE, DepthNet, Encoder
 from cvcdepth_core.networks.depth import MIN_INPUT_SIZE
@@ -94,7 +94,7 @@ def save_checkpoint(
 ) -> None:
     """Write one safetensors file; it appears complete or not at all, also when the power fails.
 
-    Raises CheckpointError when `metadata` uses a reserved key or the file cannot be written.
+    Raises CheckpointError when `metadata` uses a reserved key, OutputError when the file cannot be written.
     """
     header = dict(metadata or {})
     reserved = {_VERSION_KEY, _SPEC_KEY} & header.keys()
@@ -195,29 +195,6 @@ def _without_prefix(prefix: str, tensors: State) -> dict[str, Tensor]:
         for key, value in tensors.items()
         if key.startswith(prefix)
     }
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file that appears complete or not at all, also when the power fails; raises CheckpointError."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-        _flush_directory(path.parent)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise CheckpointError(f"{path}: cannot be written: {error}") from error
-
-
-def _flush_directory(directory: Path) -> None:
-    descriptor = os.open(directory, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _read_safetensors(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:

@@ -26,6 +26,10 @@ class TrainingError(CvcDepthError):
     """A training cannot go on."""
 
 
+class OutputError(CvcDepthError):
+    """A result cannot be written: the disk is full, the folder is not there or not ours."""
+
+
 class RecordingError(CvcDepthError):
     """A recording cannot be read, or lacks what the command needs."""
 

@@ -24,8 +24,9 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 from tqdm import tqdm
 
+from cvcdepth_core.atomic_file import write_atomically
 from cvcdepth_core.augmentation import draw_flips, jitter_colors
-from cvcdepth_core.checkpoint import Checkpoint, load_network_state, save_checkpoint, write_atomically
+from cvcdepth_core.checkpoint import Checkpoint, load_network_state, save_checkpoint
 from cvcdepth_core.errors import CheckpointError, TrainingError
 from cvcdepth_core.networks import DepthNet, PoseNet
 from cvcdepth_core.objective import ObjectiveValue, evaluate_objective

@@ -17,7 +17,7 @@ from cvcdepth_core.checkpoint import (
     load_network_state,
     save_checkpoint,
 )
-from cvcdepth_core.errors import CheckpointError
+from cvcdepth_core.errors import CheckpointError, OutputError
 from cvcdepth_core.networks import DepthNet, PoseNet
 
 SPEC = DepthModelSpec(height=384, width=640, min_depth=1.5, max_depth=200)
@@ -65,7 +65,7 @@ def test_a_failed_write_leaves_the_old_checkpoint_and_no_litter(checkpoint, dept
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("os.fsync", full_disk)
-    with pytest.raises(CheckpointError, match=r"net.safetensors: cannot be written: .*No space"):
+    with pytest.raises(OutputError, match=r"net.safetensors: cannot be written: .*No space"):
         save_checkpoint(checkpoint, SPEC, depth_net.state_dict())
     assert checkpoint.read_bytes() == before
     assert [path.name for path in checkpoint.parent.iterdir()] == [checkpoint.name]

@@ -13,7 +13,7 @@ from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
-from cvcdepth_core.checkpoint import write_atomically
+from cvcdepth_core.atomic_file import write_atomically
 from cvcdepth_core.errors import CvcDepthError
 from cvcdepth_ros.bags import file_identities
 from cvcdepth_ros.evaluation.job import EvaluationJob

@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Results appear on the disk whole or not at all."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from cvcdepth_core.errors import OutputError
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write a file that is there whole or as it was before, also when the power fails; OutputError names it."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+        _flush_directory(path.parent)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def _flush_directory(directory: Path) -> None:
+    descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
