@@ -13,6 +13,8 @@ DEV := .venv/installed/dev-$(call key,dev)
 CORE := .venv-core/installed/core_test-$(call key,core_test)
 TF2 := .venv/installed/tf2_msgs-$(shell cat tests/tf2_msgs/*.* tests/tf2_msgs/msg/* | sha256sum | cut -c1-12)
 
+BENCHMARKS := $(filter-out measuring table,$(basename $(notdir $(wildcard benchmarks/*.py))))
+
 # A sourced ROS 2 installation must not leak into the wheels' environment, and nothing here talks to other machines.
 unexport PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH CMAKE_PREFIX_PATH LD_LIBRARY_PATH RMW_IMPLEMENTATION ROS_DISTRO
 export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
@@ -20,13 +22,19 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo test lint test-ros test-core tf2_msgs lock clean
+.PHONY: help demo bench test lint test-ros test-core tf2_msgs lock clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z0-9_-]*\):.* ## /\1\t/p' Makefile | expand -t 12
 
 demo: $(DEMO) ## play the sample recording to the live node over DDS; pictures and a table in output/demo
 	.venv/bin/python -m cvcdepth_ros.demo --output output/demo
+
+bench: $(DEV) ## run every benchmark, half an hour on a quiet machine; its table into docs/performance.md
+	@mkdir -p output/bench
+	@for name in $(BENCHMARKS); do \
+		echo "$$name ..." && .venv/bin/python benchmarks/$$name.py > output/bench/$$name.jsonl || exit 1; done
+	.venv/bin/python benchmarks/table.py $(BENCHMARKS:%=output/bench/%.jsonl)
 
 test: lint test-ros test-core ## everything that CI runs
 
