@@ -66,12 +66,8 @@ class SurroundReplay:
         self._assembler = assemble_rig(recording, layout)
         self._rig: Rig | RigError = self._assembler.rig()
         self._tolerance = matching.tolerance
-        self._synchroniser: SurroundSynchronizer[RecordedImage] = SurroundSynchronizer(
-            layout.names,
-            layout.anchor_camera,
-            matching.tolerance,
-            {camera.name: camera.stamp_offset for camera in layout.cameras},
-            matching.queue_size,
+        self._synchroniser: SurroundSynchronizer[RecordedImage] = SurroundSynchronizer.of_rig(
+            layout, matching.tolerance, matching.queue_size
         )
 
     @property

@@ -45,12 +45,8 @@ class SurroundSession:
             {"published": 0, "skipped: rig not complete": 0, "skipped: no subscriber": 0, "refused": 0}
         )
         self.latencies = StageLatencies()
-        self._synchroniser: SurroundSynchronizer[ReceivedImage] = SurroundSynchronizer(
-            layout.names,
-            layout.anchor_camera,
-            parameters.tolerance,
-            {camera.name: camera.stamp_offset for camera in layout.cameras},
-            parameters.queue_size,
+        self._synchroniser: SurroundSynchronizer[ReceivedImage] = SurroundSynchronizer.of_rig(
+            layout, parameters.tolerance, parameters.queue_size
         )
         self._mailbox: Mailbox[ReceivedImage] = Mailbox(
             parameters.max_age or None, lambda: int(node.get_clock().now().nanoseconds)

@@ -38,9 +38,12 @@ from bisect import insort
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 from cvcdepth_core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from cvcdepth_core.rig import RigLayout
 
 T = TypeVar("T")
 
@@ -110,6 +113,12 @@ class SurroundSynchronizer(Generic[T]):
         self._anchor = self._streams[anchor]
         self._sets = 0
         self._lock = threading.Lock()
+
+    @classmethod
+    def of_rig(cls, layout: "RigLayout", tolerance: float, queue_size: int = 10) -> "SurroundSynchronizer[T]":
+        """Match the cameras of a rig with its anchor and its stamp offsets; the rest as in the constructor."""
+        offsets = {camera.name: camera.stamp_offset for camera in layout.cameras}
+        return cls(layout.names, layout.anchor_camera, tolerance, offsets, queue_size)
 
     def add(self, camera: str, stamp_ns: int, image: T) -> list[SurroundSet[T]]:
         """Queue one image and return the sets that it completes, oldest first: mostly none or one.
