@@ -59,6 +59,10 @@ class Prediction:
     motions: Tensor
     """[B, F, N, 4, 4] pose `context_T_target` of each camera for each context frame."""
 
+    def first_sample(self) -> Prediction:
+        """Return what is said about the first sample, without its gradient."""
+        return Prediction(*(part[:1].detach() for part in (self.disparity, self.depth, self.motions)))
+
 
 @dataclass(frozen=True)
 class Overlap:

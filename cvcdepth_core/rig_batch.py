@@ -74,6 +74,13 @@ class RigBatch:
                 setattr(moved, field.name, value.to(device, dtype if value.is_floating_point() else None))
         return moved
 
+    def first_sample(self) -> RigBatch:
+        """Return the batch's first sample as a batch of its own, without checking it again."""
+        one = copy.copy(self)
+        for name in ("frames", "masks", "intrinsics", "base_T_camera"):
+            setattr(one, name, getattr(self, name)[:1])
+        return one
+
 
 def _check_shapes(batch: RigBatch) -> None:
     if batch.frames.ndim != 6 or batch.frames.shape[3] != 3:

@@ -20,6 +20,7 @@ from typing import Any, Protocol, cast
 
 import torch
 import yaml
+from pydantic import ValidationError
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 from tqdm import tqdm
@@ -29,7 +30,7 @@ from cvcdepth_core.augmentation import draw_flips, jitter_colors
 from cvcdepth_core.checkpoint import Checkpoint, load_network_state, save_checkpoint
 from cvcdepth_core.errors import CheckpointError, TrainingError
 from cvcdepth_core.networks import DepthNet, PoseNet
-from cvcdepth_core.objective import ObjectiveValue, evaluate_objective
+from cvcdepth_core.objective import ObjectiveValue, Prediction, evaluate_objective
 from cvcdepth_core.rig_batch import RigBatch
 from cvcdepth_core.surround_model import SurroundModel
 from cvcdepth_core.training_config import AugmentationConfig, TrainingConfig
@@ -38,8 +39,32 @@ CHECKPOINT_FILE, STATE_FILE, LOG_FILE, CONFIG_FILE = "last.safetensors", "state.
 
 _MAX_SKIPPED_IN_A_ROW = 20
 
-Validation = Callable[[SurroundModel], Mapping[str, float]]
-"""Scores a model in evaluation mode; the numbers go to the log."""
+
+@dataclass(frozen=True)
+class ValidationOutcome:
+    """What a validation found."""
+
+    scores: Mapping[str, float]
+    """They go to the log."""
+    stop: bool = False
+    """Whether the run ends here, before its configured epochs (early stopping)."""
+
+
+Validation = Callable[["Trainer"], ValidationOutcome]
+"""Scores the trainer's `result`, then in evaluation mode; its `validations` tell what was found before."""
+
+
+class RunObserver(Protocol):
+    """Is told what a run does while it does it; what it takes long for, the run waits for."""
+
+    def on_step(self, trainer: Trainer, entry: Mapping[str, Any]) -> None:
+        """Take what was logged of a step."""
+
+    def on_pictures(self, trainer: Trainer, batch: RigBatch, prediction: Prediction) -> None:
+        """Take the first sample of a step and what the networks said of it, every `pictures_every` steps."""
+
+    def on_validation(self, trainer: Trainer, entry: Mapping[str, Any]) -> None:
+        """Take what was logged of a validation."""
 
 
 class Batches(Protocol):
@@ -67,6 +92,8 @@ class Progress:
     """Steps that were left out since their loss or gradient was not finite."""
     unreadable: int = 0
     """Batches none of whose samples could be read."""
+    stopped: bool = False
+    """Whether a validation has ended the run."""
 
 
 def build_surround_model(config: TrainingConfig, start: Checkpoint | None = None) -> SurroundModel:
@@ -112,15 +139,19 @@ class Trainer:
         device: torch.device | str = "cpu",
         validate: Validation | None = None,
         metadata: Mapping[str, str] | None = None,
+        observers: Sequence[RunObserver] = (),
     ) -> None:
         """`metadata` travels in the checkpoints. Raises CheckpointError when the folder holds another run."""
         self.config = config
         self.progress = Progress()
+        self.validations: list[dict[str, Any]] = []
+        """What was logged of every validation."""
         # On CPUs, channels-last makes a step of the networks a fifth to a third shorter.
         self.model = model.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._batches = batches
         self._device = torch.device(device)
         self._validate = validate
+        self._observers = tuple(observers)
         self._metadata = dict(metadata or {})
         self._run = run_directory
         self._optimizer = torch.optim.AdamW(
@@ -141,14 +172,18 @@ class Trainer:
         return self.model if self._average is None else cast(SurroundModel, self._average.module)
 
     def train(self, quiet: bool = False) -> None:
-        """Train to the configured number of epochs; raises TrainingError when the loss stays non-finite."""
+        """Train to the configured number of epochs or until a validation ends the run; it then stays ended.
+
+        Raises TrainingError when the loss stays non-finite.
+        """
         (self._run / CONFIG_FILE).write_text(yaml.safe_dump(self.config.model_dump(mode="json"), sort_keys=False))
         samples, epochs = self._batches.samples, self.config.optimizer.epochs
-        if self.progress.step == 0:
+        if self.progress.step == 0 and not self.validations:
             self._score()
+            self.save()
         done = self.progress.epoch * samples + self.progress.batch * self.config.optimizer.samples_per_batch
         with tqdm(total=epochs * samples, initial=done, unit="sample", disable=True if quiet else None) as bar:
-            while self.progress.epoch < epochs:
+            while self.progress.epoch < epochs and not self.progress.stopped:
                 self._train_epoch(bar)
                 if self.progress.epoch % self.config.validate_every == 0 or self.progress.epoch == epochs:
                     self._score()
@@ -160,6 +195,7 @@ class Trainer:
             "config": self.config.model_dump_json(),
             "samples": self._batches.samples,
             "progress": asdict(self.progress),
+            "validations": json.dumps(self.validations),
             "model": self.model.state_dict(),
             "average": None if self._average is None else self._average.state_dict(),
             "optimizer": self._optimizer.state_dict(),
@@ -167,8 +203,12 @@ class Trainer:
         content = io.BytesIO()
         torch.save(state, content)
         write_atomically(self._run / STATE_FILE, content.getvalue())
+        self.save_result(self._run / CHECKPOINT_FILE)
+
+    def save_result(self, path: Path) -> None:
+        """Write `result` as a checkpoint."""
         save_checkpoint(
-            self._run / CHECKPOINT_FILE,
+            path,
             self.config.depth,
             self.result.depth_net.state_dict(),
             self.result.pose_net.state_dict(),
@@ -177,23 +217,37 @@ class Trainer:
 
     def _resume(self) -> None:
         path = self._run / STATE_FILE
+        if path.exists():
+            state = torch.load(path, map_location=self._device, weights_only=True)
+            self._refuse_other_run(path, state)
+            self.progress = Progress(**state["progress"])
+            self.validations = json.loads(state["validations"])
+            self.model.load_state_dict(state["model"])
+            self._optimizer.load_state_dict(state["optimizer"])
+            if self._average is not None:
+                self._average.load_state_dict(state["average"])
+        self._drop_log_of_lost_steps()
+
+    def _drop_log_of_lost_steps(self) -> None:
+        """Drop what a killed run had logged after its last checkpoint: it will be made again."""
+        path = self._run / LOG_FILE
         if not path.exists():
             return
-        state = torch.load(path, map_location=self._device, weights_only=True)
-        self._refuse_other_run(path, state)
-        self.progress = Progress(**state["progress"])
-        self.model.load_state_dict(state["model"])
-        self._optimizer.load_state_dict(state["optimizer"])
-        if self._average is not None:
-            self._average.load_state_dict(state["average"])
-        _keep_log_until(self._run / LOG_FILE, self.progress.step)
+        kept, validated = [], {(entry["step"], entry["epoch"]) for entry in self.validations}
+        for line in path.read_text(encoding="utf-8").splitlines():
+            try:
+                entry = json.loads(line)
+            except ValueError:
+                break  # cut while it was written
+            place = (entry["step"], entry["epoch"])
+            if place in validated if "validation" in entry else entry["step"] <= self.progress.step:
+                kept.append(line + "\n")
+        write_atomically(path, "".join(kept).encode())
 
     def _refuse_other_run(self, path: Path, state: Mapping[str, Any]) -> None:
         """Raise unless the run that `state` is of would have computed the same; it may have been shorter."""
-        was, now = json.loads(state["config"]), self.config.model_dump(mode="json")
-        for config in (was, now):
-            config["optimizer"].pop("epochs")
-        changed = [name for name in now if was.get(name) != now[name]]
+        was, now = (_what_is_computed(config) for config in (_configuration(path, state), self.config))
+        changed = [name for name in now if was[name] != now[name]]
         if changed:
             raise CheckpointError(
                 f"{path}: was made with another configuration ({', '.join(changed)}); resume with the run's own "
@@ -216,6 +270,8 @@ class Trainer:
             entry = self._step(group_of_step)
             self.progress.batch += len(group_of_step)
             self._log(entry)
+            for observer in self._observers:
+                observer.on_step(self, entry)
             bar.update(len(group_of_step) * optimizer.samples_per_batch)
             bar.set_postfix(loss=entry["loss"], skipped=self.progress.skipped)
             if self.progress.step % self.config.checkpoint_every == 0:
@@ -231,7 +287,7 @@ class Trainer:
         readable = [batch for batch in batches if batch is not None]
         self.progress.unreadable += len(batches) - len(readable)
         self._optimizer.zero_grad(set_to_none=True)
-        values = [self._backpropagate(batch.to(self._device)) for batch in readable]
+        values = [self._backpropagate(batch.to(self._device), is_first=not i) for i, batch in enumerate(readable)]
         samples = sum(len(value.per_sample) for value in values)
         norm = self._scaled_gradient_norm(samples)
         loss = sum(float(value.per_sample.sum()) for value in values) / max(samples, 1)
@@ -247,13 +303,16 @@ class Trainer:
             "seconds": round(time.perf_counter() - began, 4),
         }
 
-    def _backpropagate(self, batch: RigBatch) -> ObjectiveValue:
+    def _backpropagate(self, batch: RigBatch, is_first: bool) -> ObjectiveValue:
         """Add the gradients of the batch's samples, summed, not averaged: the last batch of an epoch may be smaller."""
         seen, depth_flips, pose_flips = _augment(batch, self.config.augmentation)
         with torch.autocast(self._device.type, torch.bfloat16, self.config.optimizer.autocast == "bfloat16"):
             prediction = self.model(batch, seen, depth_flips, pose_flips)
         value = evaluate_objective(batch, prediction, self.config.objective)
         value.per_sample.sum().backward()  # type: ignore[no-untyped-call]
+        if is_first and (self.progress.step - 1) % self.config.pictures_every == 0:
+            for observer in self._observers:
+                observer.on_pictures(self, batch.first_sample(), prediction.first_sample())
         return ObjectiveValue(value.per_sample.detach(), {name: term.detach() for name, term in value.terms.items()})
 
     def _scaled_gradient_norm(self, samples: int) -> float:
@@ -285,13 +344,39 @@ class Trainer:
         was_training = self.result.training
         self.result.eval()
         with torch.inference_mode():
-            scores = dict(self._validate(self.result))
+            outcome = self._validate(self)
         self.result.train(was_training)
-        self._log({"step": self.progress.step, "epoch": self.progress.epoch, "validation": scores})
+        self.progress.stopped = outcome.stop
+        place = {"step": self.progress.step, "epoch": self.progress.epoch}
+        entry = {**place, "validation": dict(outcome.scores), "stop": outcome.stop}
+        self.validations.append(entry)
+        self._log(entry)
+        for observer in self._observers:
+            observer.on_validation(self, entry)
 
     def _log(self, entry: Mapping[str, Any]) -> None:
         with (self._run / LOG_FILE).open("a", encoding="utf-8") as file:
             file.write(json.dumps(entry) + "\n")
+
+
+def _configuration(path: Path, state: Mapping[str, Any]) -> TrainingConfig:
+    """Return the configuration of the run that `state` is of; fields that are newer than it have their defaults."""
+    try:
+        return TrainingConfig.model_validate_json(state["config"])
+    except ValidationError as error:
+        raise CheckpointError(f"{path}: its configuration is not one of this version: {error}") from error
+
+
+def _what_is_computed(config: TrainingConfig) -> dict[str, Any]:
+    """Return the fields that decide the weights after a step, not how many there are or what is told of them."""
+    return config.model_dump(
+        exclude={
+            "optimizer": {"epochs"},
+            "recordings": {"workers", "cache_mb"},
+            "checkpoint_every": True,
+            "pictures_every": True,
+        }
+    )
 
 
 def _augment(batch: RigBatch, config: AugmentationConfig) -> tuple[Tensor, Tensor, Tensor]:
@@ -318,17 +403,3 @@ def _averaged(model: SurroundModel, decay: float | None) -> AveragedModel | None
 def _mean_terms(values: Sequence[ObjectiveValue]) -> dict[str, float]:
     names = values[0].terms if values else {}
     return {name: float(torch.cat([value.terms[name] for value in values]).mean()) for name in names}
-
-
-def _keep_log_until(path: Path, step: int) -> None:
-    """Drop the lines of steps that a killed run had logged and that will be made again."""
-    if not path.exists():
-        return
-    kept = []
-    for line in path.read_text(encoding="utf-8").splitlines():
-        try:
-            if json.loads(line)["step"] <= step:
-                kept.append(line + "\n")
-        except (ValueError, KeyError):
-            break  # cut while it was written
-    write_atomically(path, "".join(kept).encode())

@@ -133,6 +133,8 @@ class TrainingConfig(_Section):
     """Epochs between two validations; the last epoch is always validated."""
     checkpoint_every: int = Field(default=200, ge=1)
     """Steps between two checkpoints; there is one at the end of every epoch too."""
+    pictures_every: int = Field(default=200, ge=1)
+    """Steps between two sets of pictures for those who watch the run, from the first step on."""
     seed: int = Field(default=42, ge=0)
     """Of every random draw; process r uses seed + r."""
 

@@ -15,7 +15,7 @@ from scenes import random_batch
 from cvcdepth_core.checkpoint import DepthModelSpec, load_checkpoint, save_checkpoint
 from cvcdepth_core.errors import CheckpointError, TrainingError
 from cvcdepth_core.networks import DepthNet
-from cvcdepth_core.training import Trainer, build_surround_model
+from cvcdepth_core.training import Trainer, ValidationOutcome, build_surround_model
 from cvcdepth_core.training_config import OptimizerConfig, PoseConfig, TrainingConfig
 
 SPEC = DepthModelSpec(encoder="efficientnet_lite0", height=64, width=64, min_depth=0.5, max_depth=80)
@@ -130,13 +130,12 @@ def test_a_folder_of_another_run_is_refused_by_what_differs(uninterrupted):
 def test_the_average_of_the_weights_is_what_is_saved_and_validated(tmp_path):
     settings = config(epochs=1)
     seen = []
-    run = Trainer(
-        settings,
-        build_surround_model(settings),
-        RandomBatches(),
-        tmp_path,
-        validate=lambda model: seen.append((model, model.training)) or {"score": float(len(seen))},
-    )
+
+    def validate(trainer):
+        seen.append((trainer.result, trainer.result.training))
+        return ValidationOutcome({"score": len(seen)})
+
+    run = Trainer(settings, build_surround_model(settings), RandomBatches(), tmp_path, validate=validate)
     run.train(quiet=True)
     assert seen == [(run.result, False)] * 2  # before the first step and after the last
     assert [entry["validation"]["score"] for entry in log_of(tmp_path) if "validation" in entry] == [1, 2]
@@ -144,6 +143,80 @@ def test_the_average_of_the_weights_is_what_is_saved_and_validated(tmp_path):
     key = "depth_decoder.decoder.0.conv.conv.weight"
     assert torch.equal(saved[key], run.result.depth_net.state_dict()[key])
     assert not torch.equal(saved[key], run.model.depth_net.state_dict()[key])
+
+
+class Watcher:
+    """Keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.steps, self.pictures, self.validations = [], [], []
+
+    def on_step(self, trainer, entry):
+        self.steps.append((trainer.progress.step, entry["loss"]))
+
+    def on_pictures(self, trainer, batch, prediction):
+        assert not prediction.depth.requires_grad
+        self.pictures.append((trainer.progress.step, batch.frames.shape[0], tuple(prediction.motions.shape)))
+
+    def on_validation(self, trainer, entry):
+        self.validations.append(entry)
+
+
+def watched(run, outcomes, watcher, **changes: Any):
+    settings = config(**changes).model_copy(update={"pictures_every": 3})
+    batches = RandomBatches()
+    observers = () if watcher is None else (watcher,)
+    return Trainer(
+        settings,
+        build_surround_model(settings),
+        batches,
+        run,
+        validate=lambda _: outcomes.pop(0),
+        observers=observers,
+    )
+
+
+def test_observers_are_told_of_steps_pictures_and_validations(tmp_path):
+    watcher = Watcher()
+    watched(tmp_path, [ValidationOutcome({"score": i}) for i in range(3)], watcher).train(quiet=True)
+    steps, validations = ([entry for entry in log_of(tmp_path) if key in entry] for key in ("loss", "validation"))
+    assert watcher.steps == [(entry["step"], entry["loss"]) for entry in steps]
+    assert watcher.pictures == [(step, 1, (1, 2, 3, 4, 4)) for step in (1, 4, 7)]
+    assert watcher.validations == validations
+    assert [(entry["step"], entry["validation"]["score"], entry["stop"]) for entry in validations] == [
+        (0, 0, False),
+        (4, 1, False),
+        (8, 2, False),
+    ]
+
+
+def test_a_validation_can_end_a_run_which_then_stays_ended(tmp_path):
+    verdicts = [ValidationOutcome({"score": 1.0}), ValidationOutcome({"score": 0.5}, stop=True)]
+    run = watched(tmp_path, verdicts, None)
+    run.train(quiet=True)
+    assert (run.progress.epoch, run.progress.step, run.progress.stopped) == (1, 4, True)
+    assert log_of(tmp_path)[-1] == {"step": 4, "epoch": 1, "validation": {"score": 0.5}, "stop": True}
+    again = watched(tmp_path, [], None)
+    again.train(quiet=True)
+    assert (again.progress.step, again.progress.stopped) == (4, True)
+    assert again.validations == run.validations
+    assert load_checkpoint(tmp_path / "last.safetensors").metadata["step"] == "4"
+
+
+def test_the_log_of_a_killed_run_goes_on_without_what_was_lost(tmp_path):
+    """As of a run that was killed after it had logged steps and a validation, but before it saved them."""
+    run = watched(tmp_path, [ValidationOutcome({"score": 1.0})], None, epochs=1)
+    run._score()
+    run.save()
+    lost = [{"step": 1, "epoch": 0, "loss": 0.3}, {"step": 1, "epoch": 1, "validation": {}, "stop": False}]
+    with (tmp_path / "log.jsonl").open("a") as log:
+        log.write("\n".join(json.dumps(entry) for entry in lost) + '\n{"step": 2, "lo')
+    watched(tmp_path, [ValidationOutcome({"score": 2.0})], None, epochs=1).train(quiet=True)
+    assert [(entry["step"], "validation" in entry) for entry in log_of(tmp_path)] == [
+        (0, True),
+        *((step, False) for step in (1, 2, 3, 4)),
+        (4, True),
+    ]
 
 
 def test_unreadable_batches_are_passed_over_and_counted(tmp_path):
