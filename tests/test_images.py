@@ -4,6 +4,7 @@
 import array
 import struct
 import zlib
+from contextlib import suppress
 
 import cv2
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from cvcdepth_core.errors import ImageError
-from cvcdepth_core.images import decode_compressed, decode_raw
+from cvcdepth_core.images import Reduction, decode_compressed, decode_raw
 
 WIDTH, HEIGHT = 46, 30
 PATTERNS = ("rggb", "bggr", "gbrg", "grbg")
@@ -247,3 +248,177 @@ def test_what_is_no_picture_is_refused_by_name(content: bytes, found: str):
     with pytest.raises(ImageError, match=f"^camera rear: compressed image .*{found}") as error:
         decode_compressed("webp", content, "rear")
     assert "\n" not in str(error.value)
+
+
+def _jpeg_declaring(jpeg: bytes, width: int, height: int) -> bytes:
+    """Write another size into the frame header of a baseline JPEG."""
+    frame = jpeg.index(b"\xff\xc0")
+    return jpeg[: frame + 5] + struct.pack(">HH", height, width) + jpeg[frame + 9 :]
+
+
+def _png_declaring(png: bytes, width: int, height: int) -> bytes:
+    header = _png_chunk(b"IHDR", struct.pack(">II", width, height) + png[24:29])
+    return png[:8] + header + png[8 + len(header) :]
+
+
+@pytest.mark.parametrize(
+    ("extension", "declare"), [(".jpg", _jpeg_declaring), (".png", _png_declaring)], ids=["JPEG", "PNG"]
+)
+class TestDeclaredSizes:
+    """Headers are refused before anything is decoded."""
+
+    def test_a_small_file_that_declares_a_giant_picture_is_refused(self, extension, declare, rgb):
+        bomb = declare(_encoded(extension, rgb), 65000, 65000)
+        with pytest.raises(ImageError, match="camera rear: image of 65000x65000 = 4225000000 pixels; at most 50000000"):
+            decode_compressed("jpeg", bomb, "rear")
+
+    def test_the_bound_is_the_callers(self, extension, declare, rgb):
+        encoded = _encoded(extension, rgb)
+        assert decode_compressed("jpeg", encoded, "rear", max_pixels=WIDTH * HEIGHT).shape == (HEIGHT, WIDTH, 3)
+        with pytest.raises(ImageError, match=f"1380 pixels; at most {WIDTH * HEIGHT - 1} are"):
+            decode_compressed("jpeg", encoded, "rear", max_pixels=WIDTH * HEIGHT - 1)
+
+    def test_another_size_than_the_calibrations_is_refused(self, extension, declare, rgb):
+        encoded = _encoded(extension, rgb)
+        assert decode_compressed("jpeg", encoded, "rear", size=(WIDTH, HEIGHT)).shape == (HEIGHT, WIDTH, 3)
+        with pytest.raises(ImageError, match="camera rear: image of 46x30, but its camera_info says 30x46"):
+            decode_compressed("jpeg", encoded, "rear", size=(30, 46))
+
+    @pytest.mark.parametrize(("width", "height"), [(0, 30), (46, 0), (0, 0)])
+    def test_a_picture_without_pixels_is_refused(self, extension, declare, rgb, width: int, height: int):
+        with pytest.raises(ImageError, match=f"camera rear: (JPEG|PNG) header declares {width}x{height} pixels"):
+            decode_compressed("jpeg", declare(_encoded(extension, rgb), width, height), "rear")
+
+    def test_a_header_that_contradicts_the_pixels_is_refused_or_gives_what_it_declares(self, extension, declare, rgb):
+        lying = declare(_encoded(extension, rgb), 300, 200)
+        with suppress(ImageError):
+            assert decode_compressed("jpeg", lying, "rear").shape == (200, 300, 3)
+
+
+@pytest.mark.parametrize(
+    "hiding",
+    [
+        b"\xff" * 100_000,
+        b"\xff" * 50_000 + b"\0" + b"rubbish" * 1000,
+        b"\xff\xd0\xff\x01" * 20,
+        b"\xff\xe1\0\x20" + b"\xff\xc0\0\x11\x08\0\1\0\1" + bytes(21),
+        b"\xff\xfe\0\2" * 500,
+    ],
+    ids=["fill bytes", "rubbish", "standalone markers", "frame within a comment", "many segments"],
+)
+def test_a_giant_frame_is_found_whatever_stands_before_it(rgb: NDArray[np.uint8], hiding: bytes):
+    bomb = _jpeg_declaring(_encoded(".jpg", rgb), 65000, 65000)
+    with pytest.raises(ImageError, match="65000x65000"):
+        decode_compressed("jpeg", bomb[:2] + hiding + bomb[2:], "rear")
+
+
+@pytest.mark.parametrize(
+    "rubbish", [b"\xff\xe1\0\0", b"\xff\xe1\xff", b"\xff\xfe\0\2" * 2000, b"\xff\xd9", b"\xff\xda"]
+)
+def test_a_jpeg_whose_header_leads_nowhere_is_refused(rgb: NDArray[np.uint8], rubbish: bytes):
+    jpeg = _encoded(".jpg", rgb)
+    with pytest.raises(ImageError, match=r"camera rear: compressed image of \d+ bytes is damaged: its header"):
+        decode_compressed("jpeg", jpeg[:2] + rubbish + jpeg[2:], "rear")
+
+
+@pytest.mark.parametrize("kept", range(2, 26))
+def test_a_file_cut_within_its_header_is_refused(rgb: NDArray[np.uint8], kept: int):
+    for extension in (".jpg", ".png"):
+        with pytest.raises(ImageError, match=r"^camera rear: compressed image"):
+            decode_compressed("jpeg", _encoded(extension, rgb)[:kept], "rear")
+
+
+def test_a_jpeg_with_endless_scans_is_refused_and_a_progressive_one_is_not(rgb: NDArray[np.uint8]):
+    progressive = _encoded(".jpg", rgb[..., ::-1], cv2.IMWRITE_JPEG_PROGRESSIVE, 1)
+    assert np.abs(decode_compressed("jpeg", progressive, "rear").astype(int) - rgb).max() <= 12
+    scan = progressive.rindex(b"\xff\xda")
+    with pytest.raises(ImageError, match=r"camera rear: JPEG has \d+ scans; at most 64"):
+        decode_compressed("jpeg", progressive[:-2] + progressive[scan:-2] * 100 + progressive[-2:], "rear")
+
+
+@pytest.fixture(scope="module")
+def scene() -> NDArray[np.uint8]:
+    """A picture with detail at every scale, of a size that no reduction divides."""
+    noise = np.random.default_rng(3).normal(size=(253, 317, 3))
+    layers = sum(2**i * cv2.GaussianBlur(noise, (0, 0), 2.0**i) for i in range(5))
+    picture: NDArray[np.uint8] = np.clip(128 + 20 * layers, 0, 255).astype(np.uint8)
+    return picture
+
+
+def _means(picture: NDArray[np.uint8], reduce: int) -> NDArray[np.float64]:
+    height, width = picture.shape[0] // reduce, picture.shape[1] // reduce
+    cells = picture[: height * reduce, : width * reduce].reshape(height, reduce, width, reduce, 3)
+    means: NDArray[np.float64] = cells.mean(axis=(1, 3))
+    return means
+
+
+@pytest.mark.parametrize("reduce", [2, 4, 8])
+@pytest.mark.parametrize(("extension", "largest"), [(".jpg", 16.0), (".png", 0.51)])
+def test_a_reduced_picture_holds_the_means_of_its_pixels(scene, extension: str, largest: float, reduce: Reduction):
+    encoded = _encoded(extension, scene)
+    full, reduced = decode_compressed("", encoded, "c"), decode_compressed("", encoded, "c", reduce=reduce)
+    assert reduced.shape == (-(-253 // reduce), -(-317 // reduce), 3)
+    inside = np.s_[: 253 // reduce, : 317 // reduce]
+    difference = np.abs(reduced[inside] - _means(full, reduce))
+    assert difference.mean() < 1.0
+    assert difference.max() <= largest
+
+
+def test_reduced_decoding_does_not_alias(scene):
+    stripes = np.zeros((240, 320, 3), np.uint8)
+    stripes[:, ::2] = 255
+    for extension in (".jpg", ".png"):
+        reduced = decode_compressed("", _encoded(extension, stripes), "c", reduce=2)
+        assert np.abs(reduced.astype(int) - 127).max() <= 2
+
+
+def test_reduced_decoding_is_deterministic(scene):
+    jpeg = _encoded(".jpg", scene)
+    pictures = [decode_compressed("", jpeg, "c", reduce=4) for _ in range(5)]
+    assert all(np.array_equal(picture, pictures[0]) for picture in pictures)
+
+
+def test_the_size_that_is_expected_is_the_full_one_whatever_the_reduction(scene):
+    jpeg = _encoded(".jpg", scene)
+    assert decode_compressed("", jpeg, "c", reduce=8, size=(317, 253)).shape == (32, 40, 3)
+    with pytest.raises(ImageError, match="camera c: image of 317x253, but its camera_info says 318x253"):
+        decode_compressed("", jpeg, "c", reduce=8, size=(318, 253))
+
+
+@pytest.mark.parametrize("extension", [".jpg", ".png"])
+def test_a_compressed_mosaic_gets_its_colours_before_it_is_reduced(rgb: NDArray[np.uint8], extension: str):
+    mosaic = _encoded(
+        extension, _mosaic(rgb, "rggb"), *((cv2.IMWRITE_JPEG_QUALITY, 100) if extension == ".jpg" else ())
+    )
+    found = decode_compressed("bayer_rggb8; jpeg compressed ", mosaic, "front", reduce=2)
+    assert np.abs(found[1:-1, 1:-1] - _means(rgb, 2)[1:-1, 1:-1]).max() <= 6
+
+
+@pytest.mark.parametrize("bits", [12, 16])
+@pytest.mark.parametrize("is_bigendian", [False, True])
+def test_sixteen_bits_in_the_other_byte_order_are_refused(is_bigendian: bool, bits: int):
+    noise = np.random.default_rng(5).normal(0, 3 << (bits - 8), (HEIGHT, WIDTH))
+    smooth = np.linspace(0.1, 0.9, WIDTH)[None] * 2**bits + noise
+    deep = np.clip(smooth, 0, 2**bits - 1).astype(">u2" if is_bigendian else "<u2")
+    assert _decode(deep, "mono16", is_bigendian=is_bigendian).shape == (HEIGHT, WIDTH, 3)
+    with pytest.raises(ImageError, match=f"camera front: is_bigendian = {int(not is_bigendian)}, but the bytes are"):
+        _decode(deep, "mono16", is_bigendian=not is_bigendian)
+
+
+def test_a_raw_image_beyond_the_bound_is_refused():
+    with pytest.raises(ImageError, match="camera c: image of 8x4 = 32 pixels; at most 31 are decoded"):
+        decode_raw(8, 4, "mono8", 8, False, bytes(32), "c", max_pixels=31)
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "step"), [(2**32 - 1, 1, 2**32 - 1), (1, 2**32 - 1, 1), (2**31, 2**31, 2**31)]
+)
+def test_an_enormous_raw_image_is_refused_before_memory_is_taken(width: int, height: int, step: int):
+    with pytest.raises(ImageError, match=r"^camera c: "):
+        decode_raw(width, height, "mono8", step, False, bytes(64), "c")
+
+
+def test_a_long_encoding_does_not_fill_the_log():
+    with pytest.raises(ImageError) as error:
+        decode_raw(8, 4, "x" * 10**6, 8, False, bytes(32), "c")
+    assert len(str(error.value)) < 400
