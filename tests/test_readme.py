@@ -5,7 +5,6 @@
 what `pip install .` and `colcon build` put into place.
 """
 
-import os
 import re
 import shlex
 import subprocess
@@ -41,12 +40,11 @@ def test_cvcdepth_commands_run_in_the_order_in_which_they_stand(tmp_path):
     (tmp_path / "samples").symlink_to(ROOT / "samples")
     commands = [command for command in COMMANDS if command.startswith("cvcdepth ")]
     assert {shlex.split(command)[1] for command in commands} == {"inspect", "check", "rig", "run", "evaluate", "play"}
-    environment = os.environ | {"ROS_DOMAIN_ID": "9", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     for command in commands:
         if " play " in command:
-            pytest.importorskip("rclpy", reason="`cvcdepth play` needs ROS")
+            continue  # it needs ROS: tests/ros/test_bag_play.py runs it
         words = [sys.executable, "-m", "cvcdepth_ros.bag_replay", *shlex.split(command)[1:]]
-        done = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=100)
+        done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=100)
         assert done.returncode == 0, f"{command}\n{done.stderr}"
 
 

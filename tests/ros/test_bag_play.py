@@ -4,6 +4,8 @@
 import itertools
 import json
 import os
+import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -24,7 +26,8 @@ from cvcdepth_ros.bags import RecordingWriter
 
 pytest.importorskip("rclpy", reason="no ROS in this environment")
 
-PROFILE = Path(__file__).parents[2] / "config" / "fastdds_large_shm.xml"
+ROOT = Path(__file__).parents[2]
+PROFILE = ROOT / "config" / "fastdds_large_shm.xml"
 STRING = "std_msgs/msg/String"
 
 # Subscribes the topics given as {topic: [type, reliable, latched]} and prints, after a line on its standard input, how
@@ -303,3 +306,18 @@ def test_an_unknown_topic_is_named(environment: dict[str, str]):
     assert process.returncode == 1
     (line,) = errors.splitlines()
     assert "no topic /odometry" in line
+
+
+def test_a_recording_that_is_not_there_is_named(environment: dict[str, str], tmp_path: Path):
+    process = player(environment, tmp_path / "gone.mcap")
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 1
+    (line,) = errors.splitlines()
+    assert "gone.mcap: does not exist" in line
+
+
+def test_the_readmes_command_plays_the_sample(environment: dict[str, str]):
+    (command,) = re.findall(r"^cvcdepth (play .*)$", (ROOT / "README.md").read_text(encoding="utf-8"), re.MULTILINE)
+    words = [sys.executable, "-m", "cvcdepth_ros.bag_replay", *shlex.split(command)]
+    done = subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=100)
+    assert done.returncode == 0, done.stderr
