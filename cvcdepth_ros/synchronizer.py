@@ -16,6 +16,12 @@ nearest to the anchor image, with two refinements:
 If every camera has such an image and no two stamps differ by more than the tolerance, the set is emitted, and images
 older than those used are dropped. If not, the anchor image is dropped and the others stay for the next one.
 
+**With missing cameras.** `min_cameras` lets sets leave that lack cameras. A camera is then no longer waited for once
+its newest image lies more than three periods behind the anchor's newest; it takes part again with its next image. The
+anchor itself is missing when so many others as a set needs are that far ahead of it; the first camera that is not
+stands in until it returns. Of images that are farther apart than the tolerance, those farthest from the anchor stay
+behind.
+
 **When.** As soon as waiting cannot bring a nearer image: every camera has sent one at or after the anchor's stamp, or
 its period (median of the last intervals) says that its next will not be nearer than the best one queued. Likewise an
 image that seems nearer to the next anchor image, as the anchor's period predicts it, waits for that one. Until a period
@@ -50,13 +56,15 @@ T = TypeVar("T")
 NANOSECONDS = 1_000_000_000
 _INTERVALS_FOR_PERIOD = 9
 _BEHIND_IN_A_ROW = 3
+_PATIENCE_PERIODS = 3
 
 
 @dataclass(frozen=True)
 class SurroundSet(Generic[T]):
-    """One image of every camera, in the synchroniser's camera order."""
+    """One image of every camera (of those that are there), in the synchroniser's camera order."""
 
     sequence: int  # counts the sets of one synchroniser from 0
+    anchor: str  # the camera around whose image the set was made
     stamp_ns: int  # the anchor image's own stamp: the stamp of everything computed from the set
     stamps_ns: dict[str, int]  # each image's own stamp, its camera's offset not subtracted
     images: dict[str, T]
@@ -75,6 +83,7 @@ class CameraStatistics:
     dropped: dict[str, int]
     clock_steps: int  # how often the stamps stepped back
     period_ns: int | None  # None until two images have come
+    missed: int = 0  # sets that left without this camera
 
 
 @dataclass(frozen=True)
@@ -99,18 +108,27 @@ class SurroundSynchronizer(Generic[T]):
         offsets: Mapping[str, float] | None = None,  # s, camera -> subtracted from its stamps; 0 where not given
         queue_size: int = 10,  # images per camera
         clock_jump: float = 1.0,  # s, a stamp this much behind its camera's newest is a clock step
+        min_cameras: int = 0,  # images without which no set leaves; 0: one of every camera
     ) -> None:
         """Raise ConfigError, naming the field, for a value out of range or an unknown camera."""
         _check_cameras(cameras, anchor, offsets or {})
         if isinstance(queue_size, bool) or not isinstance(queue_size, int) or queue_size < 2:
             raise ConfigError(f"queue_size: expected a whole number of at least 2 images, found {queue_size!r}")
+        if isinstance(min_cameras, bool) or not isinstance(min_cameras, int) or not 0 <= min_cameras <= len(cameras):
+            raise ConfigError(
+                f"min_cameras: expected a whole number from 0 to {len(cameras)}, the cameras there are, "
+                f"found {min_cameras!r}"
+            )
+        self._required = min_cameras or len(cameras)
         self._tolerance = _to_nanoseconds("tolerance", tolerance, minimum=0.0)
         clock_jump_ns = _to_nanoseconds("clock_jump", clock_jump, minimum=tolerance)
         self._streams: dict[str, _Stream[T]] = {}
         for camera in cameras:
             offset = _to_nanoseconds(f"offsets[{camera!r}]", (offsets or {}).get(camera, 0.0))
             self._streams[camera] = _Stream(offset, queue_size, clock_jump_ns)
-        self._anchor = self._streams[anchor]
+        self._anchor = anchor
+        self._acting_anchor = anchor
+        self._last_stamp: int | None = None  # the acting anchor's corrected one of the last set
         self._sets = 0
         self._lock = threading.Lock()
 
@@ -155,42 +173,78 @@ class SurroundSynchronizer(Generic[T]):
 
     def _decide(self, *, final: bool) -> list[SurroundSet[T]]:
         sets: list[SurroundSet[T]] = []
-        while self._anchor.stamps:
-            anchor, *later = self._anchor.stamps[:2]
-            next_anchor = later[0] if later else None
-            nearest = []
-            for stream in self._streams.values():
-                stamp = stream.nearest(anchor, self._tolerance, next_anchor)
-                if not final and (stream.may_improve(anchor, stamp) or self._may_belong_to_next(anchor, stamp)):
+        self._appoint_anchor()
+        anchor_stream = self._streams[self._acting_anchor]
+        while anchor_stream.stamps:
+            anchor, *later = anchor_stream.stamps[:2]
+            chosen = {}
+            for name, stream in self._streams.items():
+                stamp = stream.nearest(anchor, self._tolerance, later[0] if later else None)
+                if not final and self._is_worth_waiting(stream, anchor, stamp):
                     return sets  # the oldest anchor image waits, and the later ones with it
-                nearest.append(stamp)
-            stamps = [stamp for stamp in nearest if stamp is not None]
-            if len(stamps) == len(self._streams) and max(stamps) - min(stamps) <= self._tolerance:
-                sets.append(self._emit(stamps))
+                if stamp is not None:
+                    chosen[name] = stamp
+            chosen = self._within_tolerance(anchor, chosen)
+            if len(chosen) >= self._required:
+                sets.append(self._emit(chosen))
             else:
                 self._pass_over(anchor)
         return sets
 
+    def _appoint_anchor(self) -> None:
+        """Let another camera stand in for an anchor that is missing, and the anchor return when it is there."""
+        candidates = (self._anchor, *self._streams)
+        acting = next((name for name in candidates if not self._is_left_behind(name)), self._acting_anchor)
+        if acting != self._acting_anchor:
+            self._acting_anchor = acting
+            if self._last_stamp is not None:
+                self._streams[acting].drop_before(self._last_stamp + 1)  # sets come in increasing time
+
+    def _is_left_behind(self, camera: str) -> bool:
+        """Whether enough others for a set have gone on without this camera."""
+        if self._required == len(self._streams):
+            return False
+        stream = self._streams[camera]
+        return sum(_is_missing(stream, other) for other in self._streams.values()) >= self._required
+
+    def _is_worth_waiting(self, stream: "_Stream[T]", anchor: int, stamp: int | None) -> bool:
+        """Whether a nearer image of this camera, or one that says where the queued one belongs, may still come."""
+        if stream.may_improve(anchor, stamp):
+            return self._required == len(self._streams) or not _is_missing(stream, self._streams[self._acting_anchor])
+        return self._may_belong_to_next(anchor, stamp)
+
     def _may_belong_to_next(self, anchor: int, stamp: int | None) -> bool:
         """Whether the image may turn out nearer to an anchor image that has not come yet."""
-        if stamp is None or stamp <= anchor or len(self._anchor.stamps) > 1:
+        anchor_stream = self._streams[self._acting_anchor]
+        if stamp is None or stamp <= anchor or len(anchor_stream.stamps) > 1:
             return False
-        return self._anchor.period is None or _nearer_to_next(stamp, anchor, anchor + self._anchor.period)
+        return anchor_stream.period is None or _nearer_to_next(stamp, anchor, anchor + anchor_stream.period)
 
-    def _emit(self, stamps: list[int]) -> SurroundSet[T]:
-        chosen = dict(zip(self._streams, stamps, strict=True))
+    def _within_tolerance(self, anchor: int, chosen: dict[str, int]) -> dict[str, int]:
+        """Leave out the images farthest from the anchor until no two are farther apart than the tolerance."""
+        kept = dict(chosen)
+        while max(kept.values()) - min(kept.values()) > self._tolerance:
+            del kept[max(kept, key=lambda name: abs(kept[name] - anchor))]
+        return kept
+
+    def _emit(self, chosen: dict[str, int]) -> SurroundSet[T]:
+        anchor = chosen[self._acting_anchor]
+        for name in self._streams.keys() - chosen.keys():
+            self._streams[name].miss(anchor - self._tolerance)
         surround_set = SurroundSet(
             sequence=self._sets,
-            stamp_ns=self._anchor.stamps[0] + self._anchor.offset,
+            anchor=self._acting_anchor,
+            stamp_ns=anchor + self._streams[self._acting_anchor].offset,
             stamps_ns={name: stamp + self._streams[name].offset for name, stamp in chosen.items()},
             images={name: self._streams[name].take(stamp) for name, stamp in chosen.items()},
-            spread_ns=max(stamps) - min(stamps),
+            spread_ns=max(chosen.values()) - min(chosen.values()),
         )
         self._sets += 1
+        self._last_stamp = anchor
         return surround_set
 
     def _pass_over(self, anchor: int) -> None:
-        self._anchor.drop_oldest("unmatched")
+        self._streams[self._acting_anchor].drop_oldest("unmatched")
         for stream in self._streams.values():
             stream.drop_before(anchor - self._tolerance)
 
@@ -202,6 +256,7 @@ class _Stream(Generic[T]):
         self.offset = offset
         self.stamps: list[int] = []  # of the queued images, ascending
         self.newest: int | None = None  # latest stamp since the last clock step, whether still queued or not
+        self.first: int | None = None  # the first one since then
         self.period: int | None = None
         self._images: dict[int, T] = {}
         self._floor: int | None = None  # latest stamp that left the queue: nothing up to it can be used any more
@@ -209,7 +264,7 @@ class _Stream(Generic[T]):
         self._intervals: deque[int] = deque(maxlen=_INTERVALS_FOR_PERIOD)
         self._queue_size = queue_size
         self._clock_jump = clock_jump
-        self._received = self._matched = self._clock_steps = 0
+        self._received = self._matched = self._missed = self._clock_steps = 0
         self._dropped: Counter[str] = Counter()
 
     def accept(self, stamp: int, image: T) -> None:
@@ -255,6 +310,11 @@ class _Stream(Generic[T]):
         self._matched += 1
         return self._pop_oldest()
 
+    def miss(self, before: int) -> None:
+        """Note that a set leaves without this camera; its images before that stamp are of no use any more."""
+        self._missed += 1
+        self.drop_before(before)
+
     def drop_before(self, stamp: int) -> None:
         while self.stamps and self.stamps[0] < stamp:
             self.drop_oldest("unmatched")
@@ -269,12 +329,14 @@ class _Stream(Generic[T]):
         self.stamps.clear()
         self._images.clear()
         self._behind.clear()
-        self.newest = self._floor = None
+        self.newest = self.first = self._floor = None
 
     def statistics(self) -> CameraStatistics:
         dropped = {reason: count for reason, count in self._dropped.items() if count}
         queued = len(self.stamps)
-        return CameraStatistics(self._received, self._matched, queued, dropped, self._clock_steps, self.period)
+        return CameraStatistics(
+            self._received, self._matched, queued, dropped, self._clock_steps, self.period, self._missed
+        )
 
     def _pop_oldest(self) -> T:
         self._floor = self.stamps.pop(0)
@@ -295,6 +357,17 @@ class _Stream(Generic[T]):
             self.period = sorted(self._intervals)[len(self._intervals) // 2]
         if self.newest is None or stamp > self.newest:
             self.newest = stamp
+        if self.first is None:
+            self.first = stamp
+
+
+def _is_missing(stream: _Stream[T], other: _Stream[T]) -> bool:
+    """Whether the other camera has gone on so far that this one's next image is not to be waited for."""
+    period = stream.period or other.period
+    last_sign_of_life = other.first if stream.newest is None else stream.newest
+    if other.newest is None or last_sign_of_life is None or period is None:
+        return False
+    return other.newest - last_sign_of_life > _PATIENCE_PERIODS * period
 
 
 def _distance(stamp: int, anchor: int) -> int:

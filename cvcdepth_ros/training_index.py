@@ -157,7 +157,7 @@ def _collect(
 
 def _with_log_times(found: SurroundSet[RecordedImage]) -> SurroundSet[int]:
     images = {name: image.log_time for name, image in found.images.items()}
-    return SurroundSet(found.sequence, found.stamp_ns, found.stamps_ns, images, found.spread_ns)
+    return SurroundSet(found.sequence, found.anchor, found.stamp_ns, found.stamps_ns, images, found.spread_ns)
 
 
 def _thumbnail(found: SurroundSet[RecordedImage], camera: str) -> NDArray[np.uint8] | None:

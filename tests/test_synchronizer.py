@@ -517,7 +517,7 @@ def test_an_image_of_an_unknown_camera_is_refused_by_name():
 
 
 def numbered_set(sequence: int, stamp_ns: int = 0) -> SurroundSet[str]:
-    return SurroundSet(sequence, stamp_ns, {}, {}, 0)
+    return SurroundSet(sequence, "front", stamp_ns, {}, {}, 0)
 
 
 def test_the_newest_set_wins_and_the_replaced_one_is_counted():
@@ -599,3 +599,100 @@ def test_a_reader_in_another_thread_sees_sets_in_order_and_each_put_is_accounted
 def test_a_freshness_gate_that_is_not_a_positive_time_is_refused(max_age: float):
     with pytest.raises(ConfigError, match="max_age: expected a positive number of seconds, found"):
         Mailbox(max_age=max_age)
+
+
+# --- with missing cameras -------------------------------------------------------------------------------------------
+
+
+def cycles(cameras: Iterable[str], first: int, count: int) -> list[Arrival]:
+    """One image of each camera per period, 2 ms apart."""
+    return [
+        (camera, (10 + first + cycle) * PERIOD + PANDASET.index(camera) * 2 * MS)
+        for cycle in range(count)
+        for camera in cameras
+    ]
+
+
+def without(*dead: str) -> list[str]:
+    return [camera for camera in PANDASET if camera not in dead]
+
+
+def partial_synchronizer(min_cameras: int) -> SurroundSynchronizer[Arrival]:
+    return SurroundSynchronizer(PANDASET, "front", 0.05, min_cameras=min_cameras)
+
+
+def test_a_camera_that_dies_is_awaited_for_three_periods_then_no_more_and_returns_with_its_next_image():
+    synchronizer = partial_synchronizer(4)
+    assert len(feed(synchronizer, cycles(PANDASET, 0, 5), flush=False)) == 5
+    dead = cycles(without("left"), 5, 8)
+    sets = [synchronizer.add(camera, stamp, (camera, stamp)) for camera, stamp in dead]
+    waiting = next(i for i, leaving in enumerate(sets) if leaving)
+    assert dead[waiting][1] - dead[0][1] < 3.2 * PERIOD
+    assert [s.stamp_ns // PERIOD - 10 for leaving in sets for s in leaving] == list(range(5, 13))
+    assert all(list(s.images) == without("left") for leaving in sets for s in leaving)
+    # From then on nobody waits: each set leaves with its own last image.
+    assert [i % 5 for i, leaving in enumerate(sets) if leaving][1:] == [4] * (8 - waiting // 5)
+    back = feed(synchronizer, cycles(PANDASET, 13, 3), flush=False)
+    assert [len(s.images) for s in back][-2:] == [6, 6]
+    assert synchronizer.statistics().cameras["left"].missed in (8, 9)
+
+
+def test_another_camera_stands_in_for_the_anchor_until_it_returns():
+    synchronizer = partial_synchronizer(4)
+    alive = feed(synchronizer, cycles(PANDASET, 0, 5), flush=False)
+    headless = feed(synchronizer, cycles(without("front"), 5, 8), flush=False)
+    back = feed(synchronizer, cycles(PANDASET, 13, 5))
+    assert {s.anchor for s in alive} == {"front"}
+    assert {s.anchor for s in headless} == {"front_left"}
+    assert all(s.stamp_ns == s.stamps_ns["front_left"] and "front" not in s.images for s in headless)
+    assert (len(headless), len(back)) in ((7, 6), (8, 5))
+    assert [(s.anchor, len(s.images)) for s in back][-4:] == [("front", 6)] * 4
+    stamps = [s.stamp_ns for s in alive + headless + back]
+    assert stamps == sorted(set(stamps))
+
+
+def test_too_few_cameras_give_no_set():
+    synchronizer = partial_synchronizer(4)
+    assert feed(synchronizer, cycles(without("left", "back", "right"), 0, 10)) == []
+
+
+def test_without_min_cameras_a_dead_camera_holds_every_set_back():
+    synchronizer = partial_synchronizer(0)
+    assert feed(synchronizer, cycles(without("left"), 0, 10)) == []
+
+
+def test_an_image_too_far_from_the_others_stays_behind_alone():
+    synchronizer = partial_synchronizer(5)
+    late = [
+        (c, stamp - 30 * MS if c == "left" else stamp + 25 * MS * (c == "back")) for c, stamp in cycles(PANDASET, 0, 5)
+    ]
+    sets = feed(synchronizer, sorted(late, key=lambda arrival: arrival[1]))
+    assert len(sets) == 5
+    assert all(s.spread_ns <= 50 * MS and "front" in s.images and len(s.images) == 5 for s in sets)
+
+
+@given(st.integers(1, 6), st.lists(st.tuples(st.sampled_from(PANDASET), st.integers(0, 30)), max_size=4), st.data())
+@settings(max_examples=60, deadline=None)
+def test_whatever_dies_and_returns_every_set_is_large_and_close_enough(min_cameras, deaths, data):
+    gone = {
+        (camera, cycle) for camera, start in deaths for cycle in range(start, start + data.draw(st.integers(1, 20)))
+    }
+    arrivals = [(c, stamp) for c, stamp in cycles(PANDASET, 0, 40) if (c, stamp // PERIOD - 10) not in gone]
+    synchronizer = partial_synchronizer(min_cameras)
+    sets = feed(synchronizer, arrivals)
+    assert all(len(s.images) >= min_cameras and s.spread_ns <= 50 * MS for s in sets)
+    assert all(s.stamp_ns == s.stamps_ns[s.anchor] for s in sets)
+    stamps = [s.stamp_ns for s in sets]
+    assert stamps == sorted(set(stamps))
+    used = [image for s in sets for image in s.images.values()]
+    assert len(used) == len(set(used))
+    for statistics in synchronizer.statistics().cameras.values():
+        assert statistics.received == statistics.matched + statistics.queued + sum(statistics.dropped.values())
+    possible = sum(sum((c, n) not in gone for c in PANDASET) >= min_cameras for n in range(40))
+    assert len(sets) >= possible - 4 * len(deaths)
+
+
+@pytest.mark.parametrize("min_cameras", [-1, 7, True, 2.0])
+def test_an_impossible_min_cameras_is_refused(min_cameras: Any):
+    with pytest.raises(ConfigError, match="min_cameras: expected a whole number from 0 to 6"):
+        SurroundSynchronizer(PANDASET, "front", 0.05, min_cameras=min_cameras)
