@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Options and fixtures shared by the tests."""
 
+import os
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,6 +11,10 @@ from s3_server import LocalS3, local_s3
 
 # A shell that runs the tests in the background has them ignore SIGINT, and the programs they start would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# Read by torch and OpenCV when they are loaded, here and in the programs that tests start. Tests run beside each other,
+# and threads that share a processor wait for each other most of the time.
+os.environ["OMP_NUM_THREADS"] = os.environ["OPENCV_FOR_THREADS_NUM"] = "1"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

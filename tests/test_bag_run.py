@@ -16,7 +16,6 @@ import cv2
 import numpy as np
 import pytest
 import recordings
-import torch
 import yaml
 from numpy.typing import NDArray
 from recordings import CAMERAS, JAZZY, SAMPLE, Entry
@@ -72,15 +71,6 @@ def depths(path: Path) -> list[NDArray[np.float32]]:
 def assert_same_depth(left: Path, right: Path) -> None:
     for a, b in zip(depths(left), depths(right), strict=True):
         np.testing.assert_array_equal(a, b)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _one_thread() -> Iterator[None]:
-    """Several threads are slower for so small a network."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")

@@ -56,14 +56,6 @@ def frames_of(output: Path) -> Rows:
         return {(r["recording"], int(r["stamp_ns"]), r["camera"]): r for r in csv.DictReader(stream)}
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 @pytest.fixture(scope="module")
 def output(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The results of a constant predictor on the sample."""

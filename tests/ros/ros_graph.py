@@ -13,11 +13,13 @@ import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from domains import own_domain
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -25,8 +27,6 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 
 PROFILE = Path(__file__).parents[2] / "config" / "fastdds_large_shm.xml"
 TIMEOUT = 60.0
-
-_domains = itertools.count(10 + os.getpid() % 80)
 
 
 def reliable(depth: int = 100, latched: bool = False) -> QoSProfile:
@@ -44,7 +44,8 @@ class RosGraph:
     """One domain with this process's node and the processes it started."""
 
     def __init__(self) -> None:
-        self.domain = next(_domains)
+        self._resources = ExitStack()
+        self.domain = self._resources.enter_context(own_domain())
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
         os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = os.environ["FASTDDS_DEFAULT_PROFILES_FILE"] = str(PROFILE)
         self._context = Context()
@@ -55,7 +56,7 @@ class RosGraph:
         self.received: dict[str, list[Any]] = defaultdict(list)
         self.statuses: dict[str, Any] = {}
         self._processes: list[tuple[subprocess.Popen[bytes], Path]] = []
-        self._folder = tempfile.TemporaryDirectory()
+        self._folder = Path(self._resources.enter_context(tempfile.TemporaryDirectory()))
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
 
     def start_node(self, *arguments: str, **parameters: Any) -> "subprocess.Popen[bytes]":
@@ -64,7 +65,7 @@ class RosGraph:
             f"{name}:={str(value).lower() if isinstance(value, bool) else value}" for name, value in parameters.items()
         ]
         options = list(itertools.chain.from_iterable(("-p", pair) for pair in pairs))
-        log = Path(self._folder.name) / f"{len(self._processes)}.log"
+        log = self._folder / f"{len(self._processes)}.log"
         with log.open("wb") as output:
             process = subprocess.Popen(
                 [sys.executable, "-m", "cvcdepth_ros.surround_depth_node", "--ros-args", *options, *arguments],
@@ -131,7 +132,7 @@ class RosGraph:
         self._executor.shutdown()
         self.node.destroy_node()
         rclpy.shutdown(context=self._context)
-        self._folder.cleanup()
+        self._resources.close()
 
     def _on_diagnostics(self, message: Any) -> None:
         for status in message.status:

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`bag_replay play`: player and subscriber in processes of their own, over real DDS."""
 
-import itertools
 import json
 import os
 import re
@@ -19,6 +18,7 @@ from typing import Any
 
 import pytest
 import recordings
+from domains import own_domain
 from recordings import CAMERAS, JAZZY, SAMPLE, Entry
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
@@ -72,8 +72,6 @@ for _ in range(100 * len(found)):
 print(json.dumps({"found": found, "offered": offered}))
 """
 
-_domains = itertools.count(101 + os.getpid() % 60)
-
 
 class Subscriber:
     """A subscriber in a process of its own."""
@@ -114,14 +112,15 @@ class Subscriber:
 
 
 @pytest.fixture
-def environment() -> dict[str, str]:
+def environment() -> Iterator[dict[str, str]]:
     """A domain of its own for every test; no packet leaves the machine."""
-    return os.environ | {
-        "ROS_DOMAIN_ID": str(next(_domains)),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-        "FASTRTPS_DEFAULT_PROFILES_FILE": str(PROFILE),
-        "FASTDDS_DEFAULT_PROFILES_FILE": str(PROFILE),
-    }
+    with own_domain() as domain:
+        yield os.environ | {
+            "ROS_DOMAIN_ID": str(domain),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+            "FASTRTPS_DEFAULT_PROFILES_FILE": str(PROFILE),
+            "FASTDDS_DEFAULT_PROFILES_FILE": str(PROFILE),
+        }
 
 
 @contextmanager

@@ -17,11 +17,11 @@ import pytest
 
 pytest.importorskip("rclpy", reason="these tests need a ROS environment")
 
+from domains import own_domain
 from recordings import CAMERAS, JAZZY
 
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.demo.node_report import Latency, read_report
-from cvcdepth_ros.demo.processes import free_domain
 from cvcdepth_ros.demo.received import node_outputs
 
 NODE = "/surround_depth"
@@ -39,6 +39,7 @@ node = rclpy.create_node("surround_depth")
 diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
 images = node.create_publisher(Image, "{NODE}/front/image_rect", 10)
 status = DiagnosticStatus(name="surround_depth: node", hardware_id="{NODE}", message="active")
+print("ready", flush=True)
 while not images.get_subscription_count():
     diagnostics.publish(DiagnosticArray(status=[status]))
     time.sleep(0.1)
@@ -61,6 +62,12 @@ def wait_for(condition: Callable[[], Any], what: str, seconds: float = TIMEOUT) 
     return value
 
 
+@pytest.fixture
+def environment() -> Iterator[dict[str, str]]:
+    with own_domain() as domain:
+        yield os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+
+
 # The whole demo
 
 
@@ -68,7 +75,9 @@ def wait_for(condition: Callable[[], Any], what: str, seconds: float = TIMEOUT) 
 def finished_demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, "subprocess.CompletedProcess[str]"]:
     output = tmp_path_factory.mktemp("demo")
     command = [sys.executable, "-m", "cvcdepth_ros.demo", "--output", str(output), *SMALL]
-    return output, subprocess.run(command, capture_output=True, text=True, timeout=100)
+    with own_domain() as domain:
+        environment = os.environ | {"ROS_DOMAIN_ID": str(domain)}
+        return output, subprocess.run(command, env=environment, capture_output=True, text=True, timeout=150)
 
 
 def test_every_set_is_sent_matched_published_and_received(finished_demo: Any):
@@ -133,10 +142,12 @@ def test_the_recording_holds_what_was_published_and_nothing_else(finished_demo: 
 class RunningDemo:
     """A demo that has its node running."""
 
-    def __init__(self, output: Path) -> None:
+    def __init__(self, output: Path, environment: dict[str, str]) -> None:
         self.output = output
         command = [sys.executable, "-m", "cvcdepth_ros.demo", "--output", str(output), *SMALL]
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        self.process = subprocess.Popen(
+            command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
         wait_for(self._node_runs, "the node and the recorder")
         self.children = self._find_children()
 
@@ -170,8 +181,8 @@ class RunningDemo:
 
 
 @pytest.fixture
-def running_demo(tmp_path: Path) -> Iterator[RunningDemo]:
-    demo = RunningDemo(tmp_path / "demo")
+def running_demo(tmp_path: Path, environment: dict[str, str]) -> Iterator[RunningDemo]:
+    demo = RunningDemo(tmp_path / "demo", environment)
     yield demo
     if demo.process.poll() is None:
         demo.process.terminate()
@@ -204,11 +215,6 @@ def test_a_recording_that_is_not_there_is_named(tmp_path: Path):
 # The recorder
 
 
-@pytest.fixture
-def environment() -> dict[str, str]:
-    return os.environ | {"ROS_DOMAIN_ID": str(free_domain()), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-
-
 def start_recorder(output: Path, environment: dict[str, str], *options: str) -> "subprocess.Popen[str]":
     topic = ("--topic", f"{NODE}/front/image_rect", "sensor_msgs/msg/Image")
     command = [sys.executable, "-m", "cvcdepth_ros.demo.recorder", str(output), *topic, *options]
@@ -217,7 +223,10 @@ def start_recorder(output: Path, environment: dict[str, str], *options: str) -> 
 
 @pytest.fixture
 def publisher(environment: dict[str, str]) -> Iterator[None]:
-    process = subprocess.Popen([sys.executable, "-c", PUBLISHER], env=environment, stderr=subprocess.DEVNULL)
+    command = [sys.executable, "-c", PUBLISHER]
+    process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+    assert process.stdout is not None
+    process.stdout.readline()
     yield
     process.kill()
     process.wait()

@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import pytest
+from domains import own_domain
 
 pytest.importorskip("rclpy", reason="no ROS in this environment")
 pytest.importorskip("tf2_msgs", reason="tf2_msgs is not built (it needs g++)")
@@ -38,14 +39,12 @@ print(transform.header.frame_id, transform.child_frame_id, transform.transform.t
 
 
 def test_a_latched_transform_reaches_another_process():
-    environment = os.environ | {
-        "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-    }
-    with subprocess.Popen([sys.executable, "-c", PUBLISH], env=environment, stdin=subprocess.PIPE) as publisher:
-        try:
-            receive = [sys.executable, "-c", RECEIVE]
-            done = subprocess.run(receive, env=environment, capture_output=True, text=True, check=True, timeout=30)
-        finally:
-            publisher.kill()
+    with own_domain() as domain:
+        environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+        with subprocess.Popen([sys.executable, "-c", PUBLISH], env=environment, stdin=subprocess.PIPE) as publisher:
+            try:
+                receive = [sys.executable, "-c", RECEIVE]
+                done = subprocess.run(receive, env=environment, capture_output=True, text=True, check=True, timeout=60)
+            finally:
+                publisher.kill()
     assert done.stdout == "base_link front_camera_optical_frame 1.5\n"
