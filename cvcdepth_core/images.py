@@ -37,7 +37,8 @@ _TO_RGB = {
     "bayer_grbg8": cv2.COLOR_BayerGRBG2RGB,
 }
 _JPEG_SCAN, _JPEG_END = b"\xff\xda", b"\xff\xd9"
-_PNG_END = b"IEND\xaeB`\x82"
+# Writers cut a picture into pieces of 8 KiB or more.
+_MAX_PNG_CHUNKS = 20_000
 
 MAX_PIXELS = 50_000_000
 """Pixels of the largest picture that is decoded unless the caller says otherwise; each takes up to 16 bytes then."""
@@ -118,7 +119,7 @@ def decode_compressed(
     if header is None:
         raise ImageError(f"camera {camera}: {_no_header(encoded, image_format)}")
     _check_header(header, size, max_pixels, camera)
-    if not (_jpeg_is_complete(encoded) if header.format == "JPEG" else encoded.rfind(_PNG_END) > 0):
+    if not (_jpeg_is_complete(encoded) if header.format == "JPEG" else _png_is_complete(encoded)):
         raise ImageError(f"camera {camera}: compressed image of {len(encoded)} bytes has no end: it was cut")
     picture = _imdecode(encoded, _compressed_encoding(image_format), reduce, header)
     if picture is None:
@@ -173,6 +174,17 @@ def _jpeg_is_complete(encoded: bytes) -> bool:
     """Whether the last scan ends. Drivers pad files with zeros, and a thumbnail has an end of its own before it."""
     end = encoded.rfind(_JPEG_END)
     return end >= 0 and encoded.find(_JPEG_SCAN, end) < 0
+
+
+def _png_is_complete(encoded: bytes) -> bool:
+    """Whether all chunks up to the end lie within the bytes; a decoder takes the memory that each declares."""
+    position = len(PNG_START)
+    for _ in range(_MAX_PNG_CHUNKS):
+        kind = encoded[position + 4 : position + 8]
+        position += 12 + int.from_bytes(encoded[position : position + 4], "big")
+        if position > len(encoded) or kind == b"IEND":
+            return position <= len(encoded)
+    return False
 
 
 def _compressed_encoding(image_format: str) -> str:

@@ -2,6 +2,7 @@
 """Every encoding becomes the same RGB picture; every broken image is refused with the camera's name."""
 
 import array
+import resource
 import struct
 import zlib
 from contextlib import suppress
@@ -422,3 +423,17 @@ def test_a_long_encoding_does_not_fill_the_log():
     with pytest.raises(ImageError) as error:
         decode_raw(8, 4, "x" * 10**6, 8, False, bytes(32), "c")
     assert len(str(error.value)) < 400
+
+
+def test_a_png_chunk_that_declares_more_than_there_is_is_refused_before_memory_is_taken(rgb: NDArray[np.uint8]):
+    png = _encoded(".png", rgb)
+    pixels = png.index(b"IDAT") - 4
+    bomb = png[:pixels] + b"\x7f\xff\xff\xff" + png[pixels + 4 :]
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(ImageError, match=r"camera rear: compressed image of .* it was cut"):
+        decode_compressed("png", bomb, "rear")
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000
+
+
+def test_a_png_that_is_padded_is_complete(rgb: NDArray[np.uint8]):
+    assert np.array_equal(decode_compressed("png", _encoded(".png", rgb[..., ::-1]) + bytes(99), "c"), rgb)
