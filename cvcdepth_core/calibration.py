@@ -6,6 +6,7 @@ point c to (c + 0.5) s - 0.5.
 """
 
 import math
+import reprlib
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, model_validator
 
 from cvcdepth_core.errors import RigError
+from cvcdepth_core.image_headers import MAX_PIXELS
 
 DistortionModel = Literal["plumb_bob", "rational_polynomial", "equidistant"]
 _COEFFICIENT_COUNTS: dict[str, tuple[int, ...]] = {
@@ -21,6 +23,10 @@ _COEFFICIENT_COUNTS: dict[str, tuple[int, ...]] = {
     "rational_polynomial": (0, 8, 12, 14),
     "equidistant": (0, 4),
 }
+# Far beyond any lens, and far within what arithmetic holds: a focal length or a principal point in image sizes (a field
+# of view of half a minute of arc), and a distortion coefficient.
+_MAX_RATIO = 1e4
+_MAX_COEFFICIENT = 1e6
 
 
 class RegionOfInterest(BaseModel):
@@ -151,34 +157,60 @@ def first_validation_message(error: ValueError) -> str:
         return message
     # Our own checks say the value themselves, and a missing field has none.
     says_all = first["type"] in ("missing", "value_error")
-    return f"{where}: {message}" if says_all else f"{where}: {message}, found {first['input']!r:.80}"
+    # The whole of a foreign value may have no end: a few lines of YAML can refer to themselves a billion times.
+    return f"{where}: {message}" if says_all else f"{where}: {message}, found {reprlib.repr(first['input']):.80}"
 
 
 def _first_problem(calibration: Calibration) -> str | None:
     """Say what makes the calibration impossible, most basic reason first; None where nothing does."""
-    c = calibration
+    checks = (_size_problem, _count_problem, _number_problem, _matrix_problem, _region_problem)
+    return next((problem for check in checks if (problem := check(calibration))), None)
+
+
+def _size_problem(c: Calibration) -> str | None:
+    if c.width <= 0 or c.height <= 0:
+        return f"size {c.width}x{c.height}: the camera has no pixels"
+    if c.width * c.height > MAX_PIXELS:
+        return f"size {c.width}x{c.height}: more than {MAX_PIXELS} pixels"
+    return None
+
+
+def _count_problem(c: Calibration) -> str | None:
+    for name, row, want in (("k", c.k, 9), ("r", c.r, 9), ("p", c.p, 12)):
+        if len(row) != want:
+            return f"{name} has {len(row)} numbers, want {want}"
     counts = _COEFFICIENT_COUNTS[c.distortion_model]
-    lengths = {"k": (len(c.k), 9), "r": (len(c.r), 9), "p": (len(c.p), 12)}
-    numbers = {"k": c.k, "d": c.d, "r": c.r, "p": c.p}
-    checks = [
-        (c.width <= 0 or c.height <= 0, f"size {c.width}x{c.height}: the camera has no pixels"),
-        *((found != want, f"{name} has {found} numbers, want {want}") for name, (found, want) in lengths.items()),
-        *((not all(map(math.isfinite, row)), f"{name} = {row} is not finite") for name, row in numbers.items()),
-        (bool(c.k) and c.k[0] == 0.0, "K[0] = 0: the camera is not calibrated"),
-        (len(c.d) not in counts, f"{c.distortion_model} takes {_alternatives(counts)} numbers in d, found {len(c.d)}"),
-        (c.binning_x < 1 or c.binning_y < 1, f"binning {c.binning_x} x {c.binning_y}: want 1 or more"),
-    ]
-    basic = next((message for wrong, message in checks if wrong), None)
-    return basic or _matrix_problem(c) or _region_problem(c)
+    if len(c.d) not in counts:
+        return f"{c.distortion_model} takes {_alternatives(counts)} numbers in d, found {len(c.d)}"
+    return None
+
+
+def _number_problem(c: Calibration) -> str | None:
+    for name, row in (("k", c.k), ("d", c.d), ("r", c.r), ("p", c.p)):
+        if not all(map(math.isfinite, row)):
+            return f"{name} = {row} is not finite"
+    if any(abs(coefficient) > _MAX_COEFFICIENT for coefficient in c.d):
+        return f"d = {c.d}: no lens has coefficients beyond {_MAX_COEFFICIENT:g}"
+    if c.k[0] == 0.0:
+        return "K[0] = 0: the camera is not calibrated"
+    if c.binning_x < 1 or c.binning_y < 1:
+        return f"binning {c.binning_x} x {c.binning_y}: want 1 or more"
+    return None
 
 
 def _matrix_problem(c: Calibration) -> str | None:
     if not (c.k[0] > 0 and c.k[4] > 0 and c.k[8] == 1.0):
         return f"K = {c.k} is not a camera matrix: want fx > 0, fy > 0 and 1 in the corner"
+    if c.k[3] or c.k[6] or c.k[7]:
+        return f"K = {c.k} is not a camera matrix: want zeros left of the diagonal"
     if any(c.p) and not (c.p[0] > 0 and c.p[5] > 0 and c.p[10] == 1.0):
         return f"P = {c.p} is not a projection matrix: want fx > 0, fy > 0 and 1 in the corner"
+    lengths = (c.k[0], c.k[4], *((c.p[0], c.p[5]) if any(c.p) else ()))
+    size, centre = max(c.width, c.height), max(map(abs, (c.k[1], c.k[2], c.k[5], c.p[1], c.p[2], c.p[6])))
+    if not size / _MAX_RATIO < min(lengths) <= max(lengths) < size * _MAX_RATIO or centre > size * _MAX_RATIO:
+        return f"K = {c.k}, P = {c.p}: no lens sees an image of {c.width}x{c.height} so"
     R = c.rotation
-    is_rotation = np.allclose(R @ R.T, np.eye(3), atol=1e-3) and np.linalg.det(R) > 0
+    is_rotation = np.abs(R).max() < 2 and np.allclose(R @ R.T, np.eye(3), atol=1e-3) and np.linalg.det(R) > 0
     return None if is_rotation else f"R = {c.r} is not a rotation"
 
 

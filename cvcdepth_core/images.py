@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvcdepth_core.errors import ImageError
-from cvcdepth_core.image_headers import JPEG_START, PNG_START, ImageHeader, read_header
+from cvcdepth_core.image_headers import JPEG_START, MAX_PIXELS, PNG_START, ImageHeader, read_header
 
 Picture = NDArray[np.uint8]
 
@@ -40,8 +40,6 @@ _JPEG_SCAN, _JPEG_END = b"\xff\xda", b"\xff\xd9"
 # Writers cut a picture into pieces of 8 KiB or more.
 _MAX_PNG_CHUNKS = 20_000
 
-MAX_PIXELS = 50_000_000
-"""Pixels of the largest picture that is decoded unless the caller says otherwise; each takes up to 16 bytes then."""
 # Progressive JPEG has about ten, and each costs as much time as a whole picture.
 _MAX_SCANS = 64
 

@@ -32,6 +32,15 @@ IMPOSSIBLE = {
     "K not a number": ({"k": (math.nan, *K[1:])}, "k = .nan.* is not finite"),
     "P infinite": ({"p": (*P[:11], math.inf)}, "p = .*inf.* is not finite"),
     "D not a number": ({"d": (0.1, math.nan, 0, 0)}, "d = .*nan.* is not finite"),
+    "K singular": ({"k": (500.0, 0, 1, 500.0, 500, 1, 500, 500, 1)}, "K = .*zeros left of the diagonal"),
+    "K of a point": ({"k": (1e-9, 0, 1, 0, 500, 1, 0, 0, 1)}, "K = .*1e-09.*no lens sees an image of 640x480 so"),
+    "K of a telescope": ({"k": (1e30, 0, 1, 0, 500, 1, 0, 0, 1)}, "K = .*1e.30.*no lens sees"),
+    "K far off its image": ({"k": (500, 0, -1e9, 0, 500, 1, 0, 0, 1)}, "K = .*no lens sees"),
+    "P of a point": ({"p": (450.0, *P[1:5], 1e-320, *P[6:])}, "P = .*no lens sees"),
+    "R too large to multiply": ({"r": (1e200,) * 9}, "R = .*not a rotation"),
+    "D beyond any lens": ({"d": (1e300, 0, 0, 0)}, "d = .*no lens has coefficients beyond 1e.06"),
+    "giant": ({"width": 65000, "height": 65000}, "size 65000x65000: more than 50000000 pixels"),
+    "D of a million numbers": ({"d": (math.nan,) * 10**6}, "plumb_bob takes 0 or 4 or 5 numbers in d, found 1000000"),
     "K too short": ({"k": K[:8]}, "k has 8 numbers, want 9"),
     "R too long": ({"r": (1.0,) * 10}, "r has 10 numbers, want 9"),
     "P too short": ({"p": P[:9]}, "p has 9 numbers, want 12"),
@@ -59,6 +68,15 @@ def test_an_impossible_calibration_is_refused_with_camera_field_and_value(change
     with pytest.raises(RigError, match=f"camera rear_left: camera_info: .*{found}") as error:
         calibration_from_fields("rear_left", _fields(**changed))
     assert "\n" not in str(error.value)
+
+
+def test_a_value_that_contains_itself_a_billion_times_is_told_shortly():
+    bomb: list[object] = ["ha"] * 10
+    for _ in range(9):
+        bomb = [bomb] * 10
+    with pytest.raises(RigError) as error:
+        calibration_from_fields("rear", _fields(width=bomb))
+    assert len(str(error.value)) < 300
 
 
 def test_a_missing_matrix_is_named():
