@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import torch
@@ -31,13 +31,13 @@ class ColorJitterConfig(BaseModel):
     """Shift of +- this many turns of the colour circle."""
 
 
-def jitter_colors(frames: Tensor, config: ColorJitterConfig, generator: torch.Generator | None = None) -> Tensor:
+def jitter_colors(frames: Tensor, config: ColorJitterConfig, generators: Sequence[torch.Generator]) -> Tensor:
     """Jitter `frames` [B, T, N, 3, H, W] in [0, 1]; every camera of every sample draws once for all its T frames.
 
-    The four changes come in random order. The generator is a CPU one.
+    The four changes come in random order. `generators` are CPU ones, one per sample.
     """
     jittered = torch.empty_like(frames)
-    for sample in range(frames.shape[0]):
+    for sample, generator in enumerate(generators):
         for camera in range(frames.shape[2]):
             changes = _draw_changes(config, generator)
             jittered[sample, :, camera] = apply_changes(frames[sample, :, camera], changes)
@@ -51,7 +51,7 @@ def apply_changes(images: Tensor, changes: list[tuple[str, float]]) -> Tensor:
     return images
 
 
-def _draw_changes(config: ColorJitterConfig, generator: torch.Generator | None) -> list[tuple[str, float]]:
+def _draw_changes(config: ColorJitterConfig, generator: torch.Generator) -> list[tuple[str, float]]:
     names = list(_COLOR_CHANGES)
     order = torch.randperm(len(names), generator=generator).tolist()
     offsets = (2 * torch.rand(len(names), generator=generator) - 1).tolist()
@@ -103,9 +103,9 @@ def _grey(images: Tensor) -> Tensor:
     return (images * weights).sum(dim=-3, keepdim=True).expand_as(images)
 
 
-def draw_flips(samples: int, generator: torch.Generator | None = None) -> Tensor:
-    """Toss one fair coin per sample: bool [B], for all its cameras and frames."""
-    return torch.rand(samples, generator=generator) < 0.5
+def draw_flips(generators: Sequence[torch.Generator]) -> Tensor:
+    """Toss one fair coin per sample, with its CPU generator: bool [B], for all its cameras and frames."""
+    return torch.stack([torch.rand((), generator=generator) for generator in generators]) < 0.5
 
 
 def mirror(images: Tensor, flips: Tensor) -> Tensor:

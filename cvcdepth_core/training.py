@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The training loop: plain torch, one process, a run folder that survives being killed at any moment.
+"""The training loop: plain torch, one process or several, a run folder that survives being killed at any moment.
 
-Every random draw of a step comes from a generator seeded by the configuration's seed and the step's number, and the
-batches of an epoch from seed and epoch. So a resumed run computes exactly what an uninterrupted one does, and a
-checkpoint needs no generator's state.
+Every sample's random draws come from a generator seeded by the configuration's seed, the step's number and the sample's
+place in the step, and the batches of an epoch from seed and epoch. So a resumed run computes exactly what an
+uninterrupted one does, a checkpoint needs no generator's state, and it does not matter how many processes share a step.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ from __future__ import annotations
 import io
 import json
 import math
+import os
+import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -18,6 +20,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Protocol, cast
 
+import numpy as np
 import torch
 import yaml
 from pydantic import ValidationError
@@ -28,7 +31,8 @@ from tqdm import tqdm
 from cvcdepth_core.atomic_file import write_atomically
 from cvcdepth_core.augmentation import draw_flips, jitter_colors
 from cvcdepth_core.checkpoint import Checkpoint, load_network_state, save_checkpoint
-from cvcdepth_core.errors import CheckpointError, TrainingError
+from cvcdepth_core.distributed import Processes, share_batch_statistics
+from cvcdepth_core.errors import CheckpointError, ConfigError, TrainingError
 from cvcdepth_core.networks import DepthNet, PoseNet
 from cvcdepth_core.objective import ObjectiveValue, Prediction, evaluate_objective
 from cvcdepth_core.rig_batch import RigBatch
@@ -38,6 +42,7 @@ from cvcdepth_core.training_config import AugmentationConfig, TrainingConfig
 CHECKPOINT_FILE, STATE_FILE, LOG_FILE, CONFIG_FILE = "last.safetensors", "state.pt", "log.jsonl", "config.yaml"
 
 _MAX_SKIPPED_IN_A_ROW = 20
+_ALONE = Processes()
 
 
 @dataclass(frozen=True)
@@ -68,11 +73,15 @@ class RunObserver(Protocol):
 
 
 class Batches(Protocol):
-    """Where training batches come from; their order must depend on the epoch's number only."""
+    """Where a process's training batches come from; their order must depend on the epoch's number only.
+
+    Several processes take the parts of the same batches: sample i of process r's part is sample i * count + r of the
+    whole, and all have as many batches.
+    """
 
     @property
     def samples(self) -> int:
-        """Samples of one epoch."""
+        """Samples of one epoch, of all processes together."""
 
     def epoch(self, number: int, first: int = 0) -> Iterator[RigBatch | None]:
         """Give the batches of an epoch from the `first` on; None for one that could not be read."""
@@ -140,18 +149,23 @@ class Trainer:
         validate: Validation | None = None,
         metadata: Mapping[str, str] | None = None,
         observers: Sequence[RunObserver] = (),
+        processes: Processes = _ALONE,
     ) -> None:
-        """`metadata` travels in the checkpoints. Raises CheckpointError when the folder holds another run."""
+        """`metadata` travels in the checkpoints. Of several `processes`, the first alone validates, writes and tells.
+
+        Raises CheckpointError when the folder holds another run, ConfigError when the processes cannot share a step.
+        """
+        _refuse_uneven_shares(config, processes)
         self.config = config
         self.progress = Progress()
         self.validations: list[dict[str, Any]] = []
         """What was logged of every validation."""
-        # On CPUs, channels-last makes a step of the networks a fifth to a third shorter.
-        self.model = model.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self._batches = batches
         self._device = torch.device(device)
+        self.model = _prepared(model, self._device, processes)
+        self._batches = batches
+        self._processes = processes
         self._validate = validate
-        self._observers = tuple(observers)
+        self._observers = tuple(observers) if processes.is_first else ()
         self._metadata = dict(metadata or {})
         self._run = run_directory
         self._optimizer = torch.optim.AdamW(
@@ -163,7 +177,10 @@ class Trainer:
         )
         self._average = _averaged(self.model, config.optimizer.average_decay)
         self._skipped_in_a_row = 0
-        self._run.mkdir(parents=True, exist_ok=True)
+        if config.optimizer.compile:
+            _compile(self.model)
+        if processes.is_first:
+            self._run.mkdir(parents=True, exist_ok=True)
         self._resume()
 
     @property
@@ -176,13 +193,15 @@ class Trainer:
 
         Raises TrainingError when the loss stays non-finite.
         """
-        (self._run / CONFIG_FILE).write_text(yaml.safe_dump(self.config.model_dump(mode="json"), sort_keys=False))
-        samples, epochs = self._batches.samples, self.config.optimizer.epochs
+        if self._processes.is_first:
+            text = yaml.safe_dump(self.config.model_dump(mode="json"), sort_keys=False)
+            write_atomically(self._run / CONFIG_FILE, text.encode())
+        epochs = self.config.optimizer.epochs
         if self.progress.step == 0 and not self.validations:
             self._score()
             self.save()
-        done = self.progress.epoch * samples + self.progress.batch * self.config.optimizer.samples_per_batch
-        with tqdm(total=epochs * samples, initial=done, unit="sample", disable=True if quiet else None) as bar:
+        total, hidden = epochs * self._batches.samples, True if quiet or not self._processes.is_first else None
+        with tqdm(total=total, initial=self._samples_done, unit="sample", disable=hidden) as bar:
             while self.progress.epoch < epochs and not self.progress.stopped:
                 self._train_epoch(bar)
                 if self.progress.epoch % self.config.validate_every == 0 or self.progress.epoch == epochs:
@@ -191,9 +210,12 @@ class Trainer:
 
     def save(self) -> None:
         """Write what resuming needs, then the checkpoint; each appears complete or not at all."""
+        if not self._processes.is_first:
+            return
         state = {
             "config": self.config.model_dump_json(),
             "samples": self._batches.samples,
+            "samples_together": self._samples_together,
             "progress": asdict(self.progress),
             "validations": json.dumps(self.validations),
             "model": self.model.state_dict(),
@@ -215,10 +237,22 @@ class Trainer:
             {**self._metadata, "step": str(self.progress.step), "epoch": str(self.progress.epoch)},
         )
 
+    @property
+    def _samples_together(self) -> int:
+        """Samples that go through the networks of all processes together, sharing batch statistics."""
+        return self.config.optimizer.samples_per_batch * self._processes.count
+
+    @property
+    def _samples_done(self) -> int:
+        """Samples of this and the former epochs that steps were made of."""
+        samples = self._batches.samples
+        return self.progress.epoch * samples + min(self.progress.batch * self._samples_together, samples)
+
     def _resume(self) -> None:
         path = self._run / STATE_FILE
-        if path.exists():
-            state = torch.load(path, map_location=self._device, weights_only=True)
+        content = self._processes.told_by_first(_content(path) if self._processes.is_first else b"")
+        if content:
+            state = torch.load(io.BytesIO(content), map_location=self._device, weights_only=True)
             self._refuse_other_run(path, state)
             self.progress = Progress(**state["progress"])
             self.validations = json.loads(state["validations"])
@@ -226,7 +260,8 @@ class Trainer:
             self._optimizer.load_state_dict(state["optimizer"])
             if self._average is not None:
                 self._average.load_state_dict(state["average"])
-        self._drop_log_of_lost_steps()
+        if self._processes.is_first:
+            self._drop_log_of_lost_steps()
 
     def _drop_log_of_lost_steps(self) -> None:
         """Drop what a killed run had logged after its last checkpoint: it will be made again."""
@@ -253,6 +288,11 @@ class Trainer:
                 f"{path}: was made with another configuration ({', '.join(changed)}); resume with the run's own "
                 f"{CONFIG_FILE}, or choose another folder"
             )
+        if state["samples_together"] != self._samples_together:
+            raise CheckpointError(
+                f"{path}: {state['samples_together']} samples went through the networks together, now it is "
+                f"{self._samples_together} (optimizer.samples_per_batch x {self._processes.count} processes)"
+            )
         if state["samples"] != self._batches.samples:
             raise CheckpointError(
                 f"{path}: was made from {state['samples']} samples, now there are {self._batches.samples}; "
@@ -265,14 +305,19 @@ class Trainer:
         for group in self._optimizer.param_groups:
             group["lr"] = optimizer.learning_rate * optimizer.decay_factor**decays
         batches = self._batches.epoch(self.progress.epoch, self.progress.batch)
+        length = optimizer.samples_per_step // self._samples_together
         self.model.train()
-        while group_of_step := list(islice(batches, optimizer.samples_per_step // optimizer.samples_per_batch)):
-            entry = self._step(group_of_step)
-            self.progress.batch += len(group_of_step)
+        while True:
+            began = time.perf_counter()
+            if not (batches_of_step := list(islice(batches, length))):
+                break
+            entry = {"seconds_waiting": round(time.perf_counter() - began, 4), **self._step(batches_of_step)}
+            entry["seconds"] = round(time.perf_counter() - began, 4)
+            self.progress.batch += len(batches_of_step)
             self._log(entry)
             for observer in self._observers:
                 observer.on_step(self, entry)
-            bar.update(len(group_of_step) * optimizer.samples_per_batch)
+            bar.update(self._samples_done - bar.n)
             bar.set_postfix(loss=entry["loss"], skipped=self.progress.skipped)
             if self.progress.step % self.config.checkpoint_every == 0:
                 self.save()
@@ -281,42 +326,66 @@ class Trainer:
 
     def _step(self, batches: Sequence[RigBatch | None]) -> dict[str, Any]:
         """Make one optimiser step of several batches; return what is logged of it."""
-        began = time.perf_counter()
         self.progress.step += 1
-        torch.manual_seed(self.config.seed * 1_000_003 + self.progress.step)
-        readable = [batch for batch in batches if batch is not None]
+        readable = self._readable_by_all(batches)
         self.progress.unreadable += len(batches) - len(readable)
         self._optimizer.zero_grad(set_to_none=True)
-        values = [self._backpropagate(batch.to(self._device), is_first=not i) for i, batch in enumerate(readable)]
-        samples = sum(len(value.per_sample) for value in values)
-        norm = self._scaled_gradient_norm(samples)
-        loss = sum(float(value.per_sample.sum()) for value in values) / max(samples, 1)
+        values = [self._backpropagate(batch.to(self._device), place) for place, batch in readable.items()]
+        samples, loss, terms = self._means(values)
+        norm = self._mean_gradient_norm(samples)
         self._update_weights(math.isfinite(loss) and math.isfinite(norm), samples)
         return {
             "step": self.progress.step,
             "epoch": self.progress.epoch,
+            "samples": samples,
             "loss": loss,
-            "terms": _mean_terms(values),
+            "terms": terms,
             "gradient_norm": norm,
             "learning_rate": self._optimizer.param_groups[0]["lr"],
             "skipped": self.progress.skipped,
-            "seconds": round(time.perf_counter() - began, 4),
         }
 
-    def _backpropagate(self, batch: RigBatch, is_first: bool) -> ObjectiveValue:
+    def _readable_by_all(self, batches: Sequence[RigBatch | None]) -> dict[int, RigBatch]:
+        """Return the batches, by their place in the step, of which every process could read something.
+
+        The processes have to go through the networks as often, or they would wait for each other's statistics for ever.
+        """
+        missing = torch.tensor([float(batch is None) for batch in batches], device=self._device)
+        somewhere = self._processes.add_up(missing).tolist()
+        return {place: batch for place, batch in enumerate(batches) if batch is not None and not somewhere[place]}
+
+    def _backpropagate(self, batch: RigBatch, place: int) -> ObjectiveValue:
         """Add the gradients of the batch's samples, summed, not averaged: the last batch of an epoch may be smaller."""
-        seen, depth_flips, pose_flips = _augment(batch, self.config.augmentation)
-        with torch.autocast(self._device.type, torch.bfloat16, self.config.optimizer.autocast == "bfloat16"):
+        config = self.config
+        generators = [
+            _generator(config.seed, self.progress.step, place * self._samples_together + sample)
+            for sample in range(self._processes.rank, self._processes.count * len(batch.frames), self._processes.count)
+        ]
+        seen, depth_flips, pose_flips = _augment(batch, config.augmentation, generators)
+        with torch.autocast(self._device.type, torch.bfloat16, config.optimizer.autocast == "bfloat16"):
             prediction = self.model(batch, seen, depth_flips, pose_flips)
-        value = evaluate_objective(batch, prediction, self.config.objective)
+        value = evaluate_objective(batch, prediction, config.objective, _identity_noise(batch, generators))
         value.per_sample.sum().backward()  # type: ignore[no-untyped-call]
-        if is_first and (self.progress.step - 1) % self.config.pictures_every == 0:
+        if place == 0 and (self.progress.step - 1) % config.pictures_every == 0:
             for observer in self._observers:
                 observer.on_pictures(self, batch.first_sample(), prediction.first_sample())
         return ObjectiveValue(value.per_sample.detach(), {name: term.detach() for name, term in value.terms.items()})
 
-    def _scaled_gradient_norm(self, samples: int) -> float:
-        """Turn the gradients' sum into their mean and shorten it if configured; return its length before."""
+    def _means(self, values: Sequence[ObjectiveValue]) -> tuple[int, float, dict[str, float]]:
+        """Return the number of samples of all processes, their mean loss and the means of its terms."""
+        if not values:
+            return 0, 0.0, {}
+        columns = {"": [value.per_sample for value in values]}
+        columns |= {name: [value.terms[name].flatten() for value in values] for name in values[0].terms}
+        joined = [torch.cat(column).double() for column in columns.values()]
+        sums = torch.stack([torch.stack([column.sum(), torch.ones_like(column).sum()]) for column in joined])
+        totals, counts = self._processes.add_up(sums).unbind(1)
+        means = dict(zip(columns, (totals / counts).tolist(), strict=True))
+        return int(counts[0]), means.pop(""), means
+
+    def _mean_gradient_norm(self, samples: int) -> float:
+        """Turn the gradients' sum into the mean of all processes and shorten it if configured; return its length."""
+        self._processes.add_up_gradients(list(self.model.parameters()))
         for parameter in self.model.parameters():
             if parameter.grad is not None:
                 parameter.grad /= max(samples, 1)
@@ -341,22 +410,59 @@ class Trainer:
     def _score(self) -> None:
         if self._validate is None:
             return
-        was_training = self.result.training
-        self.result.eval()
-        with torch.inference_mode():
-            outcome = self._validate(self)
-        self.result.train(was_training)
-        self.progress.stopped = outcome.stop
-        place = {"step": self.progress.step, "epoch": self.progress.epoch}
-        entry = {**place, "validation": dict(outcome.scores), "stop": outcome.stop}
+        scores = self._scores(self._validate) if self._processes.is_first else b""
+        entry = json.loads(self._processes.told_by_first(scores))
+        self.progress.stopped = entry["stop"]
         self.validations.append(entry)
         self._log(entry)
         for observer in self._observers:
             observer.on_validation(self, entry)
 
+    def _scores(self, validate: Validation) -> bytes:
+        """Validate; return what is logged of it, as JSON."""
+        was_training = self.result.training
+        self.result.eval()
+        with torch.inference_mode():
+            outcome = validate(self)
+        self.result.train(was_training)
+        place = {"step": self.progress.step, "epoch": self.progress.epoch}
+        return json.dumps({**place, "validation": dict(outcome.scores), "stop": outcome.stop}).encode()
+
     def _log(self, entry: Mapping[str, Any]) -> None:
-        with (self._run / LOG_FILE).open("a", encoding="utf-8") as file:
-            file.write(json.dumps(entry) + "\n")
+        if self._processes.is_first:
+            with (self._run / LOG_FILE).open("a", encoding="utf-8") as file:
+                file.write(json.dumps(entry) + "\n")
+
+
+def _prepared(model: SurroundModel, device: torch.device, processes: Processes) -> SurroundModel:
+    # On CPUs, channels-last makes a step of the networks a fifth to a third shorter.
+    model = model.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return model if processes.count == 1 else cast(SurroundModel, share_batch_statistics(model, device))
+
+
+def _refuse_uneven_shares(config: TrainingConfig, processes: Processes) -> None:
+    together, step = config.optimizer.samples_per_batch * processes.count, config.optimizer.samples_per_step
+    if step % together:
+        raise ConfigError(
+            f"optimizer.samples_per_step is {step}, expected a multiple of {together}: samples_per_batch "
+            f"({config.optimizer.samples_per_batch}) x {processes.count} processes"
+        )
+
+
+def _compile(model: SurroundModel) -> None:
+    """Have torch translate the networks, not the objective, which is many small steps on small tensors."""
+    compiler = os.environ.get("CXX", "g++")
+    if shutil.which(compiler) is None:
+        raise ConfigError(
+            f"optimizer.compile is true, but torch.compile needs a C++ compiler and {compiler!r} is not there; install "
+            "g++, name another in the environment variable CXX, or leave compile off"
+        )
+    model.depth_net.compile()
+    model.pose_net.compile()
+
+
+def _content(path: Path) -> bytes:
+    return path.read_bytes() if path.exists() else b""
 
 
 def _configuration(path: Path, state: Mapping[str, Any]) -> TrainingConfig:
@@ -371,7 +477,7 @@ def _what_is_computed(config: TrainingConfig) -> dict[str, Any]:
     """Return the fields that decide the weights after a step, not how many there are or what is told of them."""
     return config.model_dump(
         exclude={
-            "optimizer": {"epochs"},
+            "optimizer": {"epochs", "samples_per_batch"},
             "recordings": {"workers", "cache_mb"},
             "checkpoint_every": True,
             "pictures_every": True,
@@ -379,13 +485,31 @@ def _what_is_computed(config: TrainingConfig) -> dict[str, Any]:
     )
 
 
-def _augment(batch: RigBatch, config: AugmentationConfig) -> tuple[Tensor, Tensor, Tensor]:
+def _generator(seed: int, step: int, place: int) -> torch.Generator:
+    """Return the generator of the sample at `place` of a step."""
+    state = np.random.SeedSequence([seed, step, place]).generate_state(1)
+    return torch.Generator().manual_seed(int(state[0]))
+
+
+def _augment(
+    batch: RigBatch, config: AugmentationConfig, generators: Sequence[torch.Generator]
+) -> tuple[Tensor, Tensor, Tensor]:
     """Draw what the networks see: jittered frames, and which samples each network sees mirrored."""
-    seen = jitter_colors(batch.frames, config.color_jitter)
-    flips = draw_flips(len(batch.frames)).to(batch.frames.device)
+    seen = jitter_colors(batch.frames, config.color_jitter, generators)
+    flips = draw_flips(generators).to(batch.frames.device)
     none = torch.zeros_like(flips)
     depth_flips = flips if config.flip in ("depth", "both") else none
     return seen, depth_flips, flips if config.flip in ("pose", "both") else none
+
+
+def _identity_noise(batch: RigBatch, generators: Sequence[torch.Generator]) -> Tensor:
+    """Draw the objective's noise on the batch's device, where there may be much to draw."""
+    contexts = batch.contexts[:, :, :, :1]
+    noise = torch.empty_like(contexts)
+    for sample, generator in zip(noise, generators, strict=True):
+        seed = int(torch.randint(2**31, (), generator=generator))
+        sample.normal_(generator=torch.Generator(noise.device).manual_seed(seed))
+    return noise
 
 
 def _averaged(model: SurroundModel, decay: float | None) -> AveragedModel | None:
@@ -398,8 +522,3 @@ def _averaged(model: SurroundModel, decay: float | None) -> AveragedModel | None
         return torch.lerp(average, current, 1 - min(decay, young))
 
     return AveragedModel(model, avg_fn=update)
-
-
-def _mean_terms(values: Sequence[ObjectiveValue]) -> dict[str, float]:
-    names = values[0].terms if values else {}
-    return {name: float(torch.cat([value.terms[name] for value in values]).mean()) for name in names}

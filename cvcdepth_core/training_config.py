@@ -83,13 +83,15 @@ class OptimizerConfig(_Section):
     samples_per_step: int = Field(default=4, ge=1)
     """Samples, of all cameras each, whose gradients make one step: processes x samples per process x accumulation."""
     samples_per_batch: int = Field(default=1, ge=1)
-    """Samples that go through the networks together; a divisor of `samples_per_step`."""
+    """Samples that go through a process's networks together; a divisor of `samples_per_step`."""
     max_gradient_norm: float | None = Field(default=None, gt=0)
     """Longer gradients are shortened to this."""
     average_decay: float | None = Field(default=None, gt=0, lt=1)
     """Decay per step of the weights' moving average; with it, the average is what is validated and saved."""
     autocast: Literal["none", "bfloat16"] = "none"
     """Precision of the networks; views and losses stay in float32."""
+    compile: bool = False
+    """Have torch.compile translate the networks at the first step, which takes minutes and a C++ compiler."""
 
     @model_validator(mode="after")
     def _batches_make_steps(self) -> OptimizerConfig:
@@ -136,7 +138,7 @@ class TrainingConfig(_Section):
     pictures_every: int = Field(default=200, ge=1)
     """Steps between two sets of pictures for those who watch the run, from the first step on."""
     seed: int = Field(default=42, ge=0)
-    """Of every random draw; process r uses seed + r."""
+    """Of every random draw; how many processes share a step does not change the draws."""
 
     @model_validator(mode="after")
     def _pose_consistency_has_poses_to_compare(self) -> TrainingConfig:

@@ -24,7 +24,7 @@ def generator(seed: int = 0) -> torch.Generator:
 
 def test_the_frames_of_a_camera_share_one_draw_and_cameras_and_samples_do_not():
     frame = torch.rand(1, 1, 1, 3, 6, 8, generator=generator())
-    jittered = jitter_colors(frame.expand(2, 3, 4, 3, 6, 8), ColorJitterConfig(), generator())
+    jittered = jitter_colors(frame.expand(2, 3, 4, 3, 6, 8), ColorJitterConfig(), [generator(0), generator(1)])
     assert torch.equal(jittered[:, 0], jittered[:, 1])
     assert torch.equal(jittered[:, 0], jittered[:, 2])
     draws = jittered[:, 0].flatten(0, 1)
@@ -34,7 +34,7 @@ def test_the_frames_of_a_camera_share_one_draw_and_cameras_and_samples_do_not():
 
 def test_the_same_generator_gives_the_same_jitter():
     frames = torch.rand(1, 3, 2, 3, 6, 8)
-    draws = [jitter_colors(frames, ColorJitterConfig(), generator(seed)) for seed in (5, 5, 6)]
+    draws = [jitter_colors(frames, ColorJitterConfig(), [generator(seed)]) for seed in (5, 5, 6)]
     assert torch.equal(draws[0], draws[1])
     assert not torch.equal(draws[0], draws[2])
 
@@ -42,7 +42,7 @@ def test_the_same_generator_gives_the_same_jitter():
 def test_no_jitter_changes_nothing():
     frames = torch.rand(1, 3, 2, 3, 6, 8)
     still = ColorJitterConfig(brightness=0, contrast=0, saturation=0, hue=0)
-    torch.testing.assert_close(jitter_colors(frames, still, generator()), frames)
+    torch.testing.assert_close(jitter_colors(frames, still, [generator()]), frames)
 
 
 def test_each_change_does_what_its_name_says():
@@ -71,7 +71,7 @@ def test_the_order_of_the_changes_counts():
 
 
 def test_the_coin_is_fair_and_tossed_per_sample():
-    flips = draw_flips(4000, generator())
+    flips = draw_flips([generator(seed) for seed in range(4000)])
     assert flips.dtype == torch.bool
     assert 0.45 < float(flips.float().mean()) < 0.55
 

@@ -244,7 +244,7 @@ def test_the_gradient_of_a_step_is_the_mean_over_its_samples_however_they_are_ba
     weight = run.model.pose_net.pose_decoder.net[0].weight
     for samples in (1, 4):
         weight.grad = torch.full_like(weight, 6.0)
-        run._scaled_gradient_norm(samples)
+        run._mean_gradient_norm(samples)
         assert float(weight.grad.mean()) == pytest.approx(6 / samples)
 
 
