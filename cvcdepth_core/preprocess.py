@@ -95,15 +95,23 @@ def to_tensor(pictures: Sequence[Picture], device: torch.device | str = "cpu") -
 def self_occlusion_mask(camera: Camera, rectifier: Rectifier) -> NDArray[np.float32]:
     """Return the camera's mask at the network's size, float32 [H, W] in [0, 1], 1 = valid, with soft edges (method, 2).
 
-    Without a mask file everything is valid. RigError names a file that cannot be read or has another size.
+    Without mask file and polygons everything is valid. RigError names a file that cannot be read or has another size.
     """
-    if camera.mask is None:
+    if camera.mask is None and not camera.mask_polygons:
         return np.ones((rectifier.height, rectifier.width), dtype=np.float32)
-    mask = _read_mask(camera.mask, camera.name)
     try:
-        return rectifier(mask, camera.name).astype(np.float32) / 255.0
+        return rectifier(_raw_mask(camera), camera.name).astype(np.float32) / 255.0
     except ImageError as error:
         raise RigError(f"mask {camera.mask}: {error}") from error
+
+
+def _raw_mask(camera: Camera) -> NDArray[np.uint8]:
+    """Return the mask file's content with the polygons drawn in, 0 on the vehicle and 255 elsewhere."""
+    width, height = camera.calibration.image_size
+    mask = np.full((height, width), 255, np.uint8) if camera.mask is None else _read_mask(camera.mask, camera.name)
+    for polygon in camera.mask_polygons:
+        cv2.fillPoly(mask, [np.round(polygon).astype(np.int32)], 0)
+    return mask
 
 
 def _read_mask(path: Path, camera: str) -> NDArray[np.uint8]:
@@ -117,20 +125,40 @@ def _read_mask(path: Path, camera: str) -> NDArray[np.uint8]:
     return found
 
 
+def raw_pixels(calibration: Calibration, rectified: bool, intrinsics: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return where each pixel of the raw image lies in the rectified picture with `intrinsics`, float32 [h, w, 2]."""
+    width, height = calibration.image_size
+    raw = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).reshape(-1, 1, 2).astype(np.float64)
+    source, distortion, rotation = _raw_view(calibration, rectified)
+    undistort = cv2.fisheye.undistortPoints if _is_fisheye(calibration, rectified) else cv2.undistortPoints
+    pixels = undistort(raw, source, distortion, R=rotation, P=intrinsics)
+    return np.asarray(pixels, np.float32).reshape(height, width, 2)
+
+
 def _sampling_maps(
     calibration: Calibration, intrinsics: NDArray[np.float64], size: tuple[int, int], rectified: bool
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Where each sample of the fine grid lies in the raw picture: x and y, float32 [H oy, W ox], in pixels."""
-    if rectified:
-        source, distortion, rotation = calibration.rectified_intrinsics, np.zeros(4), np.eye(3)
-    else:
-        source, distortion, rotation = calibration.raw_intrinsics, calibration.distortion, calibration.rotation
+    source, distortion, rotation = _raw_view(calibration, rectified)
     ox, oy = (_oversampling(source[axis, axis] / intrinsics[axis, axis]) for axis in (0, 1))
     fine = scale_intrinsics(intrinsics, (ox, oy))
-    fisheye = calibration.distortion_model == "equidistant" and not rectified
+    fisheye = _is_fisheye(calibration, rectified)
     build = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
     x, y = build(source, distortion, rotation, fine, (size[0] * ox, size[1] * oy), cv2.CV_32FC1)
     return x, y
+
+
+def _raw_view(
+    calibration: Calibration, rectified: bool
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return the camera matrix, distortion and rectifying rotation of the pictures that the camera sends."""
+    if rectified:
+        return calibration.rectified_intrinsics, np.zeros(4), np.eye(3)
+    return calibration.raw_intrinsics, calibration.distortion, calibration.rotation
+
+
+def _is_fisheye(calibration: Calibration, rectified: bool) -> bool:
+    return calibration.distortion_model == "equidistant" and not rectified
 
 
 def _ray_radii(calibration: Calibration, intrinsics: NDArray[np.float64], size: tuple[int, int]) -> NDArray[np.float64]:

@@ -77,6 +77,8 @@ class CameraEntry(BaseModel):
     """Seconds by which its stamps are later than the anchor's for simultaneous exposures."""
     mask: Path | None = None
     """PNG of the image's size, 0 where the vehicle itself is in view, 255 elsewhere; relative to the rig file."""
+    mask_polygons: tuple[tuple[tuple[float, float], ...], ...] = ()
+    """Outlines of the vehicle itself, each of (x, y) in pixels of the raw image; they add to `mask`."""
     calibration: Calibration | None = None
     """Intrinsics and distortion; without them, those of CameraInfo."""
     base_T_camera: PoseEntry | None = None
@@ -142,6 +144,7 @@ class RigLayout(BaseModel):
                     _pose_of(entry, base_T_cameras or {}, self.base_frame),
                     entry.rectified,
                     entry.mask,
+                    entry.mask_polygons,
                 )
                 for entry in self.cameras
             ),
@@ -160,6 +163,7 @@ class Camera:
     base_T_camera: Pose
     rectified: bool = False
     mask: Path | None = None
+    mask_polygons: tuple[tuple[tuple[float, float], ...], ...] = ()
 
     def __post_init__(self) -> None:
         check_rigid(self.base_T_camera, f"camera {self.name}: base_T_camera")

@@ -130,10 +130,20 @@ def build_surround_model(config: TrainingConfig, start: Checkpoint | None = None
 
 
 def _refuse_other_meaning(start: Checkpoint, config: TrainingConfig) -> None:
-    for name in ("encoder", "min_depth", "max_depth", "focal_scale"):
-        found, want = getattr(start.spec, name), getattr(config.depth, name)
+    # Depth goes with fx / focal_scale, and fx with the width: at another width, focal_scale has to follow.
+    same_meaning = start.spec.focal_scale * config.depth.width / start.spec.width
+    for name, found in (
+        ("encoder", start.spec.encoder),
+        ("min_depth", start.spec.min_depth),
+        ("max_depth", start.spec.max_depth),
+        ("focal_scale", same_meaning),
+    ):
+        want = getattr(config.depth, name)
         if found != want:
-            raise CheckpointError(f"{start.path}: {name} is {found}, but the configuration's depth.{name} is {want}")
+            at = f" at a width of {config.depth.width}" if name == "focal_scale" else ""
+            raise CheckpointError(
+                f"{start.path}: {name} is {found}{at}, but the configuration's depth.{name} is {want}"
+            )
 
 
 class Trainer:

@@ -12,11 +12,14 @@ from cvcdepth_ros.version import package_version
 
 if TYPE_CHECKING:
     from cvcdepth_core.rig import Camera, Rig, RigLayout
+    from cvcdepth_ros.bags import Location
 
 SUMMARY = """Write a rig file from a recording.
 
 Finds the cameras, takes their calibrations from camera_info and their poses from /tf_static, orders them
-counter-clockwise around the vehicle from the front one, and computes which of them see the same space."""
+counter-clockwise around the vehicle from the front one, and computes which of them see the same space. With --masks it
+finds where a camera sees the vehicle itself, which stands still in the picture while the scene moves, and writes a PNG
+for it beside the rig file."""
 EXAMPLES: tuple[str, ...] = (
     "rig drive.mcap",
     "rig drive/ -o rigs/shuttle.yaml --base-frame base_footprint --anchor front",
@@ -31,6 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--base-frame", default="base_link", metavar="FRAME", help="the vehicle's frame [base_link]")
     parser.add_argument("--anchor", metavar="NAME", help="camera whose stamp a set carries [the front one]")
+    parser.add_argument("--masks", action="store_true", help="find the vehicle's own body (reads the whole recording)")
     parser.add_argument("--force", action="store_true", help="overwrite the rig file")
     add_json(parser)
 
@@ -45,13 +49,24 @@ def execute(arguments: argparse.Namespace) -> None:
         raise ConfigError(f"{arguments.output}: exists already; --force overwrites it")
     with open_recording(arguments.recording) as recording:
         layout = discover_rig(recording, arguments.base_frame)
-        name = recording.path.name
+        path = recording.path
     layout = layout.model_copy(update={"anchor": _anchor(layout, arguments.anchor)})
+    if arguments.masks:
+        layout = _with_found_masks(layout, path, arguments.output)
     result = _describe(layout, layout.complete())
-    source = f"bag_replay rig {package_version()}, from the recording {name}"
+    source = f"bag_replay rig {package_version()}, from the recording {path.name}"
     save_rig_layout(arguments.output, layout, f"Written by {source}.\n{_overlaps_text(result)}")
     result = {"file": str(arguments.output), "recording": arguments.recording, **result}
     print_result(result, _text(result), arguments.json)
+
+
+def _with_found_masks(layout: "RigLayout", recording: "Location", output: Path) -> "RigLayout":
+    from cvcdepth_ros.self_occlusion import find_self_occlusion, save_masks
+    from cvcdepth_ros.settings import MatchingSettings
+    from cvcdepth_ros.training_index import build_index
+
+    masks = find_self_occlusion(build_index(recording, MatchingSettings(), layout))
+    return save_masks(layout, masks, output.parent / f"{output.stem}_masks")
 
 
 def _anchor(layout: "RigLayout", wanted: str | None) -> str:
@@ -65,7 +80,13 @@ def _describe(layout: "RigLayout", rig: "Rig") -> dict[str, Any]:
         "base_frame": rig.base_frame,
         "anchor": rig.anchor,
         "cameras": [
-            {"name": camera.name, "image_topic": entry.image_topic, "frame_id": entry.frame_id, **_view(camera)}
+            {
+                "name": camera.name,
+                "image_topic": entry.image_topic,
+                "frame_id": entry.frame_id,
+                "mask": str(entry.mask) if entry.mask else None,
+                **_view(camera),
+            }
             for entry, camera in zip(layout.cameras, rig.cameras, strict=True)
         ],
         "overlaps": [
@@ -104,11 +125,12 @@ def _text(result: dict[str, Any]) -> str:
             f"{camera['horizontal_view_degrees']:.1f}",
             f"{camera['width']}x{camera['height']}",
             "rectified" if camera["rectified"] else camera["distortion"],
+            camera["mask"] or "none",
             camera["image_topic"],
         )
         for camera in result["cameras"]
     ]
-    header = ("camera", "yaw (deg)", "view (deg)", "size", "distortion", "images")
+    header = ("camera", "yaw (deg)", "view (deg)", "size", "distortion", "mask", "images")
     return (
         f"{table(header, cameras)}\n\n{_overlaps_text(result)}\n\n"
         f"base frame {result['base_frame']}, anchor camera {result['anchor']}; written to {result['file']}"
