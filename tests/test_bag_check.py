@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """`bag_replay check`: each check passes on the sample, and fails, with its remedy, on a sample spoiled on purpose."""
 
+import itertools
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +45,8 @@ def check(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     def run(recording: Path | Iterable[Entry], *options: str) -> Checks:
         if not isinstance(recording, Path):
             recording = recordings.write_rosbag2(tmp_path / "spoiled", recording)
-        code = main(["check", str(recording), "--json", *options])
+        skipped = [] if "--skip" in options else ["--skip", "places"]  # the one that costs a second
+        code = main(["check", str(recording), "--json", *skipped, *options])
         out, err = capsys.readouterr()
         (result,) = json.loads(out)["recordings"]
         failed = [found["name"] for found in result["checks"] if found["status"] == "failed"]
@@ -61,13 +63,13 @@ def statuses(checks: Checks) -> dict[str, str]:
     return {name: found["status"] for name, found in checks.items()}
 
 
-PASSED = dict.fromkeys(CHECKS, "passed") | {"ego masks": "skipped"}
+PASSED = dict.fromkeys(CHECKS, "passed") | {"ego masks": "skipped", "places": "skipped"}
 
 
 def test_the_sample_passes_and_the_values_are_its_own(check):
     checks = check(SAMPLE)
     assert statuses(checks) == PASSED
-    assert [found["number"] for found in checks.values()] == list(range(1, 11))
+    assert [found["number"] for found in checks.values()] == list(range(1, 13))
     sets = checks["sets"]["values"]
     assert (sets["sets"], sets["first"], sets["last"]) == (10, "back", "right")
     assert sets["spread"] == pytest.approx(0.081, abs=0.001)
@@ -346,6 +348,72 @@ def test_an_unknown_encoding_fails(check, sample):
     assert "yuv422" in found["finding"]
 
 
+def exchanged_poses(first: str, second: str):
+    """What gives two cameras each other's place on /tf_static."""
+
+    def exchange(message: Any) -> None:
+        links = {link.child_frame_id: link for link in message.transforms}
+        one, other = (links[f"{camera}_camera_optical_frame"] for camera in (first, second))
+        one.transform, other.transform = other.transform, one.transform
+
+    return exchange
+
+
+@pytest.mark.parametrize("pair", [("left", "right"), ("front", "front_left"), ("right", "back")])
+def test_cameras_that_were_swapped_are_named(pair, check, sample):
+    swapped = recordings.changed(sample, "/tf_static", exchanged_poses(*pair))
+    found = check(swapped, "--skip", "LiDAR")["places"]
+    assert found["status"] == "failed"
+    assert sorted(found["values"]["cameras"]) == sorted(pair)
+    assert found["values"]["exchanged_error"] < 0.7 * found["values"]["error"]
+
+
+def test_topics_that_were_swapped_are_named_as_well(check, sample, rig_file: Path, tmp_path: Path):
+    rig = yaml.safe_load(rig_file.read_text())
+    front, back = (next(c for c in rig["cameras"] if c["name"] == name) for name in ("front_left", "front_right"))
+    front["image_topic"], back["image_topic"] = back["image_topic"], front["image_topic"]
+    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(rig))
+    found = check(SAMPLE, "--rig", str(tmp_path / "rig.yaml"), "--skip", "LiDAR")["places"]
+    assert (found["status"], sorted(found["values"]["cameras"])) == ("failed", ["front_left", "front_right"])
+
+
+@pytest.mark.parametrize("recording", [SAMPLE, FULL], ids=["sample", "full"])
+def test_no_exchange_explains_the_pictures_of_a_right_rig_better(recording, check):
+    if not recording.exists():
+        pytest.skip("the full recording is not shipped")
+    found = check(recording, "--skip", "LiDAR")["places"]
+    assert found["status"] == "passed"
+    assert found["values"]["exchanged_error"] > 1.3 * found["values"]["error"]
+
+
+def blackened(entries: Iterable[Entry], topic: str, first: int = 0) -> Iterator[Entry]:
+    """The same recording, the pictures of one topic black from the `first` on."""
+    number = itertools.count()
+
+    def blacken(message: Any) -> None:
+        if next(number) >= first:
+            message.data = cv2.imencode(".jpg", np.full((540, 960, 3), 3, np.uint8))[1].ravel()
+
+    return recordings.changed(entries, topic, blacken)
+
+
+def test_black_pictures_fail_and_some_of_them_are_a_warning(check, sample, tmp_path: Path):
+    always = recordings.write_rosbag2(tmp_path / "always", blackened(sample, LEFT))
+    found = check(always)["brightness"]
+    assert (found["status"], found["values"]["pictures"]) == ("failed", {"left": 3})
+    late = recordings.write_rosbag2(tmp_path / "late", blackened(sample, LEFT, first=6))
+    found = check(late)["brightness"]
+    assert (found["status"], found["values"]["pictures"]) == ("warning", {"left": 1})
+
+
+def test_a_check_can_be_left_out_but_not_one_that_there_is_not(capsys: pytest.CaptureFixture[str]):
+    assert main(["check", str(SAMPLE), "--tolerance", "0.05", "--skip", "sets"]) == 0
+    assert "left out as you wanted" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="2"):
+        main(["check", str(SAMPLE), "--skip", "set"])
+    assert "no check is called 'set'; there are cameras, " in capsys.readouterr().err
+
+
 def test_damage_is_told_and_what_is_left_is_checked(check, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     path = recordings.cut(recordings.SAMPLE_MCAP, tmp_path / "cut.mcap")
     assert statuses(check(path)) == PASSED
@@ -372,7 +440,7 @@ def test_every_recording_is_checked_and_one_that_cannot_be_read_is_named(tmp_pat
     out, err = capsys.readouterr()
     bad, good = json.loads(out)["recordings"]
     assert "begins with" in bad["unreadable"]
-    assert good["counts"] == {"passed": 9, "skipped": 1}
+    assert good["counts"] == {"passed": 11, "skipped": 1}
     assert "bad.mcap" in err
     assert "good.mcap" not in err
 

@@ -3,10 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import NamedTuple
 
 from cvcdepth_ros.checks.context import CheckContext, CheckOptions, CheckResult, Status
+from cvcdepth_ros.checks.picture_checks import check_brightness, check_places
 from cvcdepth_ros.checks.rig_checks import check_camera_infos, check_cameras, check_encodings, check_transforms
 from cvcdepth_ros.checks.scene_checks import check_lidar, check_masks, check_motion, check_overlaps
 from cvcdepth_ros.checks.time_checks import check_sets, check_stamps
@@ -24,7 +25,12 @@ CHECKS: Mapping[str, Callable[[CheckContext], CheckResult]] = {
     "LiDAR": check_lidar,
     "motion": check_motion,
     "encodings": check_encodings,
+    "brightness": check_brightness,
+    "places": check_places,
 }
+
+
+_LEFT_OUT = CheckResult("skipped", "left out as you wanted")
 
 
 class NumberedResult(NamedTuple):
@@ -35,6 +41,9 @@ class NumberedResult(NamedTuple):
     result: CheckResult
 
 
-def run_checks(context: CheckContext) -> list[NumberedResult]:
-    """Run all checks, each whatever the others found."""
-    return [NumberedResult(number, name, check(context)) for number, (name, check) in enumerate(CHECKS.items(), 1)]
+def run_checks(context: CheckContext, left_out: Collection[str] = ()) -> list[NumberedResult]:
+    """Run all checks, each whatever the others found, without those named in `left_out`."""
+    return [
+        NumberedResult(number, name, _LEFT_OUT if name in left_out else check(context))
+        for number, (name, check) in enumerate(CHECKS.items(), 1)
+    ]

@@ -4,10 +4,10 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +20,13 @@ from cvcdepth_ros.lidar import VehicleMotion, cloud_topics
 from cvcdepth_ros.messages import picture_from_message
 from cvcdepth_ros.recorded_rig import IMAGE_TYPES, collect_rig, discover_layout
 from cvcdepth_ros.rig_assembly import RigAssembler
+from cvcdepth_ros.synchronizer import SurroundSet, SurroundSynchronizer
 from cvcdepth_ros.topic_timing import TopicTiming
 
 Status = Literal["passed", "warning", "failed", "skipped"]
 
 _KEPT_SWEEPS = 3
+_SHOWN_SETS = 3
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,14 @@ class CheckOptions:
     """Log time to read to (exclusive), ns."""
 
 
+class ImageTimes(NamedTuple):
+    """When one image was taken and recorded, ns."""
+
+    camera: str
+    stamp: int
+    log_time: int
+
+
 class CheckContext:
     """One recording, read once."""
 
@@ -85,8 +95,8 @@ class CheckContext:
         """The first impossible pose."""
         self.timings: dict[str, TopicTiming] = {}
         """Of the topics with images and LiDAR sweeps."""
-        self.images: list[tuple[str, int]] = []
-        """Camera and stamp (ns) of every image, in the order of recording."""
+        self.images: list[ImageTimes] = []
+        """Every image, in the order of recording."""
         self.sweeps: dict[str, list[Any]] = defaultdict(list)
         """The first sweeps of each LiDAR; RecordingError in place of one that is no message."""
         self._first_images: dict[str, RecordedMessage] = {}
@@ -115,7 +125,34 @@ class CheckContext:
 
     def stamps(self, camera: str) -> NDArray[np.int64]:
         """Return the stamps [M] of a camera's images, ns, sorted."""
-        return np.array(sorted(stamp for name, stamp in self.images if name == camera), dtype=np.int64)
+        return np.array(sorted(image.stamp for image in self.images if image.camera == camera), dtype=np.int64)
+
+    def match(
+        self, layout: RigLayout, tolerance: float, changed_offsets: Mapping[str, float] | None = None
+    ) -> list[SurroundSet[int]]:
+        """Match the images as the node does; the sets hold their log times (ns). Stamp offsets are in seconds."""
+        offsets = {camera.name: camera.stamp_offset for camera in layout.cameras} | dict(changed_offsets or {})
+        synchroniser: SurroundSynchronizer[int] = SurroundSynchronizer(
+            layout.names, layout.anchor_camera, tolerance, offsets, self.options.queue_size
+        )
+        sets = [found for image in self.images for found in synchroniser.add(*image)]
+        return sets + synchroniser.flush()
+
+    def shown_sets(self) -> Iterator[dict[str, Picture]]:
+        """Decode a few sets, spread over the recording; pictures that cannot be decoded are left out."""
+        if self.layout is None:
+            return
+        sets = self.match(self.layout, self.options.tolerance)
+        topics = {camera.name: camera.image_topic for camera in self.layout.cameras}
+        for found in (sets[len(sets) * (2 * i + 1) // (2 * _SHOWN_SETS)] for i in range(min(_SHOWN_SETS, len(sets)))):
+            wanted = {(topics[camera], log_time): camera for camera, log_time in found.images.items()}
+            times = found.images.values()
+            messages = self.recording.messages(set(topics.values()), min(times), max(times) + 1)
+            read = {
+                wanted[key]: message for message in messages if (key := (message.topic, message.log_time)) in wanted
+            }
+            pictures = {camera: self._picture(camera, message) for camera, message in read.items()}
+            yield {camera: picture for camera, picture in pictures.items() if not isinstance(picture, str)}
 
     def _collected(self, layout: RigLayout | None) -> RigAssembler | None:
         try:
@@ -161,7 +198,7 @@ class CheckContext:
         for camera in cameras:
             self._first_images.setdefault(camera, message)
             if stamp is not None:
-                self.images.append((camera, stamp))
+                self.images.append(ImageTimes(camera, stamp, message.log_time))
         if message.topic in self.lidars and len(self.sweeps[message.topic]) < _KEPT_SWEEPS:
             self.sweeps[message.topic].append(self._deserialized(message))
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from cvcdepth_core.rig import RigLayout
 from cvcdepth_ros.checks.context import CheckContext, CheckResult, Status
-from cvcdepth_ros.synchronizer import NANOSECONDS, SurroundSet, SurroundSynchronizer
+from cvcdepth_ros.synchronizer import NANOSECONDS, SurroundSet
 from cvcdepth_ros.topic_timing import Timing
 
 _FEW_STEPS_BACK = 0.01
@@ -52,7 +52,7 @@ def check_sets(context: CheckContext) -> CheckResult:
     if silent:
         remedy = "record their images, or give a rig file without them (--rig)"
         return CheckResult("failed", f"no image of {', '.join(silent)}", remedy, {"images": received})
-    sets = _match(context, layout, context.options.tolerance)
+    sets = context.match(layout, context.options.tolerance)
     anchor, tolerance = layout.anchor_camera, context.options.tolerance
     values = {"sets": len(sets), "images": received, "tolerance": tolerance, **_spread(sets, layout)}
     finding = f"{len(sets)} sets of the {received[anchor]} images of {anchor} at a tolerance of {tolerance:g} s"
@@ -65,7 +65,7 @@ def check_sets(context: CheckContext) -> CheckResult:
     return CheckResult(status, f"{finding}; {limit}", remedy, {**values, **proposal})
 
 
-def _spread(sets: Sequence[SurroundSet[None]], layout: RigLayout) -> dict[str, Any]:
+def _spread(sets: Sequence[SurroundSet[int]], layout: RigLayout) -> dict[str, Any]:
     """Return the median spread (s) of the sets' corrected stamps, and which cameras are first and last."""
     if not sets:
         return {}
@@ -75,7 +75,7 @@ def _spread(sets: Sequence[SurroundSet[None]], layout: RigLayout) -> dict[str, A
     return {"spread": spread, "first": order[0], "last": order[-1], "seconds_later": later}
 
 
-def _seconds_later(sets: Sequence[SurroundSet[None]], layout: RigLayout) -> dict[str, float]:
+def _seconds_later(sets: Sequence[SurroundSet[int]], layout: RigLayout) -> dict[str, float]:
     """Return the median seconds by which each camera's corrected stamp is later than the anchor's."""
     anchor = layout.anchor_camera
     offsets = {camera.name: camera.stamp_offset for camera in layout.cameras}
@@ -92,13 +92,13 @@ def _limit(
 ) -> tuple[str, str, dict[str, Any]]:
     """Say what keeps sets from forming, what would help, and that in values: clocks, the tolerance, or lost images."""
     offsets = _clock_differences(context, layout)
-    shifted = len(_match(context, layout, context.options.tolerance, offsets))
+    shifted = len(context.match(layout, context.options.tolerance, offsets))
     if offsets and shifted > sets:
         told = ", ".join(f"{name} {offset:+.3f} s" for name, offset in offsets.items())
         remedy = f"give stamp_offset in a rig file ({told}): {shifted} sets; or set the cameras' clocks alike"
         proposal = {"limited_by": list(offsets), "stamp_offset": offsets}
         return f"limited by the clock of {', '.join(offsets)}", remedy, proposal
-    wide = _match(context, layout, max(context.options.tolerance, _period(context, layout)))
+    wide = context.match(layout, max(context.options.tolerance, _period(context, layout)))
     if len(wide) > sets:
         return _limit_by_spread(context, layout, wide)
     fewest = min(received, key=received.__getitem__)
@@ -107,14 +107,14 @@ def _limit(
 
 
 def _limit_by_spread(
-    context: CheckContext, layout: RigLayout, wide: Sequence[SurroundSet[None]]
+    context: CheckContext, layout: RigLayout, wide: Sequence[SurroundSet[int]]
 ) -> tuple[str, str, dict[str, Any]]:
     """Propose the tolerance that most of the sets need which a wide one finds."""
     needed = float(np.percentile([found.spread_ns for found in wide], 95)) / NANOSECONDS
     tolerance = round(math.ceil(needed / _TOLERANCE_STEP) * _TOLERANCE_STEP, 3)
     ends = _spread(wide, layout)
     cameras = [ends["first"], ends["last"]]
-    remedy = f"--tolerance {tolerance:g} gives {len(_match(context, layout, tolerance))} sets"
+    remedy = f"--tolerance {tolerance:g} gives {len(context.match(layout, tolerance))} sets"
     limit = f"limited by {' and '.join(cameras)}, {1e3 * ends['spread']:.0f} ms apart"
     return limit, remedy, {"limited_by": cameras, "proposed_tolerance": tolerance}
 
@@ -136,14 +136,3 @@ def _clock_differences(context: CheckContext, layout: RigLayout) -> dict[str, fl
 def _period(context: CheckContext, layout: RigLayout) -> float:
     anchor = next(camera for camera in layout.cameras if camera.name == layout.anchor_camera)
     return context.timings[anchor.image_topic].timing().interval or 0.0
-
-
-def _match(
-    context: CheckContext, layout: RigLayout, tolerance: float, changed_offsets: Mapping[str, float] | None = None
-) -> list[SurroundSet[None]]:
-    offsets = {camera.name: camera.stamp_offset for camera in layout.cameras} | dict(changed_offsets or {})
-    synchroniser: SurroundSynchronizer[None] = SurroundSynchronizer(
-        layout.names, layout.anchor_camera, tolerance, offsets, context.options.queue_size
-    )
-    sets = [found for camera, stamp in context.images for found in synchroniser.add(camera, stamp, None)]
-    return sets + synchroniser.flush()

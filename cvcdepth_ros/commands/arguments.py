@@ -48,6 +48,22 @@ def add_window(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--duration", type=positive, metavar="S", help="seconds of the recording to take [to its end]")
 
 
+def add_skip(parser: argparse.ArgumentParser) -> None:
+    """Declare checks that are to be left out, for `refuse_unknown_checks`."""
+    parser.add_argument(
+        "--skip", action="append", default=[], metavar="CHECK", help="leave a check out, by its name; can be repeated"
+    )
+
+
+def refuse_unknown_checks(arguments: argparse.Namespace) -> None:
+    """End the program as wrong use when `--skip` names no check."""
+    from cvcdepth_ros.checks import CHECKS
+
+    unknown = [name for name in arguments.skip if name not in CHECKS]
+    if unknown:
+        arguments.usage_error(f"argument --skip: no check is called {unknown[0]!r}; there are {', '.join(CHECKS)}")
+
+
 def add_json(parser: argparse.ArgumentParser) -> None:
     """Declare `--json`."""
     parser.add_argument("--json", action="store_true", help="print the result as one JSON document")

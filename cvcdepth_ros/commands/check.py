@@ -14,10 +14,12 @@ from cvcdepth_ros.commands.arguments import (
     add_json,
     add_quiet,
     add_recordings,
+    add_skip,
     add_window,
     positive,
     print_result,
     recording_progress,
+    refuse_unknown_checks,
     window_ns,
 )
 from cvcdepth_ros.settings import MatchingSettings
@@ -29,8 +31,8 @@ if TYPE_CHECKING:
 
 SUMMARY = """Check whether recordings and a rig will work, with a remedy for what will not.
 
-Ten numbered checks: cameras, calibrations, transforms, stamps, sets, overlaps, masks, LiDAR, motion and encodings. The
-exit code is 1 when a check failed; warnings leave it at 0."""
+Twelve numbered checks: cameras, calibrations, transforms, stamps, sets, overlaps, masks, LiDAR, motion, encodings,
+brightness, and whether two cameras were swapped. The exit code is 1 when a check failed; warnings leave it at 0."""
 EXAMPLES: tuple[str, ...] = (
     "check drive.mcap",
     "check drives/ --rig rig.yaml --tolerance 0.05 --lidar /lidar/points --json",
@@ -73,6 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--lidar", action="append", metavar="TOPIC", help="a LiDAR; can be repeated [all point clouds of a recording]"
     )
+    add_skip(parser)
     add_window(parser)
     add_quiet(parser)
     add_json(parser)
@@ -83,6 +86,7 @@ def execute(arguments: argparse.Namespace) -> None:
     from cvcdepth_core.rig import load_rig_layout
     from cvcdepth_ros.bags import find_recordings
 
+    refuse_unknown_checks(arguments)
     layout = load_rig_layout(arguments.rig) if arguments.rig else None
     checked = [_checked(location, layout, arguments) for location in find_recordings(arguments.recordings)]
     result = {"recordings": [_json(one) for one in checked]}
@@ -108,7 +112,7 @@ def _checked(location: "Location", layout: "RigLayout | None", arguments: argpar
             )
             with recording_progress(recording, window, arguments.quiet) as progress:
                 context = CheckContext(recording, options, layout, progress)
-            return Checked(str(location), run_checks(context), recording.damage, None)
+            return Checked(str(location), run_checks(context, arguments.skip), recording.damage, None)
     except CvcDepthError as error:
         return Checked(str(location), [], None, str(error))
 
