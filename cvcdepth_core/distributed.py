@@ -62,13 +62,26 @@ class Processes:
             distributed.broadcast_object_list(contents, src=0)
         return contents[0]
 
+    @contextmanager
+    def first_goes_ahead(self) -> Iterator[None]:
+        """Let the others begin the block when the first is through with it: it leaves there what they find."""
+        if not self.is_first:
+            self.told_by_first(b"")
+        yield
+        if self.is_first:
+            self.told_by_first(b"")
+
+
+ALONE = Processes()
+"""This process, without others."""
+
 
 @contextmanager
 def launched_processes() -> Iterator[Processes]:
     """Join the other processes that torchrun started; without torchrun, or with one process, this one is alone."""
     count = int(os.environ["WORLD_SIZE"]) if distributed.is_torchelastic_launched() else 1
     if count == 1:
-        yield Processes()
+        yield ALONE
         return
     distributed.init_process_group(timeout=_PATIENCE)
     yield Processes(distributed.get_rank(), count)

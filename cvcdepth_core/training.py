@@ -31,7 +31,7 @@ from tqdm import tqdm
 from cvcdepth_core.atomic_file import write_atomically
 from cvcdepth_core.augmentation import draw_flips, jitter_colors
 from cvcdepth_core.checkpoint import Checkpoint, load_network_state, save_checkpoint
-from cvcdepth_core.distributed import Processes, share_batch_statistics
+from cvcdepth_core.distributed import ALONE, Processes, share_batch_statistics
 from cvcdepth_core.errors import CheckpointError, ConfigError, TrainingError
 from cvcdepth_core.networks import DepthNet, PoseNet
 from cvcdepth_core.objective import ObjectiveValue, Prediction, evaluate_objective
@@ -42,7 +42,6 @@ from cvcdepth_core.training_config import AugmentationConfig, TrainingConfig
 CHECKPOINT_FILE, STATE_FILE, LOG_FILE, CONFIG_FILE = "last.safetensors", "state.pt", "log.jsonl", "config.yaml"
 
 _MAX_SKIPPED_IN_A_ROW = 20
-_ALONE = Processes()
 
 
 @dataclass(frozen=True)
@@ -159,13 +158,15 @@ class Trainer:
         validate: Validation | None = None,
         metadata: Mapping[str, str] | None = None,
         observers: Sequence[RunObserver] = (),
-        processes: Processes = _ALONE,
+        processes: Processes = ALONE,
     ) -> None:
         """`metadata` travels in the checkpoints. Of several `processes`, the first alone validates, writes and tells.
 
-        Raises CheckpointError when the folder holds another run, ConfigError when the processes cannot share a step.
+        Raises CheckpointError when the folder holds another run, ConfigError when the processes cannot share a step,
+        TrainingError when they have not found the same samples.
         """
         _refuse_uneven_shares(config, processes)
+        _refuse_different_samples(batches.samples, processes)
         self.config = config
         self.progress = Progress()
         self.validations: list[dict[str, Any]] = []
@@ -456,6 +457,15 @@ def _refuse_uneven_shares(config: TrainingConfig, processes: Processes) -> None:
         raise ConfigError(
             f"optimizer.samples_per_step is {step}, expected a multiple of {together}: samples_per_batch "
             f"({config.optimizer.samples_per_batch}) x {processes.count} processes"
+        )
+
+
+def _refuse_different_samples(samples: int, processes: Processes) -> None:
+    first = int(processes.told_by_first(str(samples).encode()))
+    if samples != first:
+        raise TrainingError(
+            f"process {processes.rank} has {samples} samples, the first has {first}: the machines do not have the same "
+            "recordings"
         )
 
 

@@ -10,7 +10,7 @@ from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
+from itertools import cycle, islice, pairwise
 from typing import Any, Literal, NamedTuple
 
 import cv2
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
+from cvcdepth_core.distributed import ALONE, Processes
 from cvcdepth_core.errors import ImageError, RecordingError
 from cvcdepth_core.images import Picture
 from cvcdepth_core.poses import inverse
@@ -283,12 +284,13 @@ class _EpochOrder:
 
 
 class RecordingBatches:
-    """Batches of training samples, shuffled anew every epoch; each batch is of one rig.
+    """The part of the training samples that is this process's, shuffled anew every epoch; each batch is of one rig.
 
-    The order depends on seed and epoch only, so that a run can be resumed at any batch.
+    The order depends on seed and epoch only, so that a run can be resumed at any batch. Samples that go through the
+    networks of several processes together are of one rig, too.
     """
 
-    def __init__(self, indexes: Sequence[RecordingIndex], config: TrainingConfig) -> None:
+    def __init__(self, indexes: Sequence[RecordingIndex], config: TrainingConfig, processes: Processes = ALONE) -> None:
         """Find the samples; RecordingError names recording and values when there are none."""
         refuse_standstill(indexes, config.recordings)
         samples = [
@@ -298,7 +300,8 @@ class RecordingBatches:
         ]
         self.reader = SampleReader(indexes, samples, config.depth.height, config.depth.width, config.recordings)
         self._rig_groups = _group_by_rig(indexes, samples)
-        self._samples_per_batch = config.optimizer.samples_per_batch
+        self._processes = processes
+        self._samples_together = config.optimizer.samples_per_batch * processes.count
         self._seed = config.seed
         self._order = _EpochOrder()
         self._loader = _loader(self.reader, self._order, config.recordings.workers)
@@ -308,20 +311,27 @@ class RecordingBatches:
 
     @property
     def samples(self) -> int:
-        """Samples of one epoch."""
+        """Samples of one epoch, of all processes together."""
         return len(self.reader)
 
     def epoch(self, number: int, first: int = 0) -> Iterator[RigBatch | None]:
         """Give the batches of an epoch from the `first` on; None for one whose images are all damaged."""
-        self._order.batches = self._shuffled(number)[first:]
+        rank, count = self._processes.rank, self._processes.count
+        self._order.batches = [_at_least(together, count)[rank::count] for together in self._shuffled(number)[first:]]
         yield from self._loader
 
     def _shuffled(self, epoch: int) -> list[list[int]]:
+        """Return the samples that go together through the networks of all processes."""
         generator = np.random.default_rng([self._seed, epoch])
-        size = self._samples_per_batch
+        size = self._samples_together
         orders = [generator.permutation(group).tolist() for group in self._rig_groups]
         batches = [order[start : start + size] for order in orders for start in range(0, len(order), size)]
         return [batches[i] for i in generator.permutation(len(batches))]
+
+
+def _at_least(samples: list[int], count: int) -> list[int]:
+    """Repeat samples, at the end of a rig's, until every process has one: they wait for each other."""
+    return list(islice(cycle(samples), max(count, len(samples))))
 
 
 def _group_by_rig(indexes: Sequence[RecordingIndex], samples: Sequence[Sample]) -> list[list[int]]:

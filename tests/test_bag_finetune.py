@@ -2,6 +2,8 @@
 """`finetune`: three steps on the shipped recording, and what it refuses."""
 
 import json
+import subprocess
+import sys
 
 import pytest
 import recordings
@@ -49,6 +51,33 @@ def test_a_recording_becomes_a_checkpoint_and_the_same_command_again_adds_nothin
     assert json.loads((tmp_path / "run" / "finetune.json").read_text()) == result
     assert finetune(config(), tmp_path / "run") == 0
     assert load_checkpoint(tmp_path / "run" / "last.safetensors").metadata["step"] == "3"
+
+
+def test_torchrun_trains_with_two_processes_as_one_does_with_their_samples(config, tmp_path):
+    alone = SMALL["optimizer"] | {"samples_per_batch": 2}
+    assert finetune(config(optimizer=alone), tmp_path / "alone") == 0
+    torchrun = ["torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "cvcdepth_ros.bag_replay"]
+    arguments = [
+        "finetune",
+        SAMPLE,
+        "--config",
+        config(),
+        "-o",
+        tmp_path / "both",
+        "--from-scratch",
+        "--device",
+        "cpu",
+        "--json",
+    ]
+    finished = subprocess.run(
+        [sys.executable, "-m", *torchrun, *map(str, arguments)], capture_output=True, text=True, check=False
+    )
+    assert finished.returncode == 0, finished.stderr
+    assert json.loads(finished.stdout)["steps"] == 3
+    logs = [(tmp_path / run / "log.jsonl").read_text().splitlines() for run in ("alone", "both")]
+    one, two = ([json.loads(line)["loss"] for line in lines] for lines in logs)
+    assert len(two) == 3
+    assert two[0] == pytest.approx(one[0], rel=1e-3)  # Adam makes of rounding whole steps; see test_distributed.py
 
 
 def test_training_goes_on_from_a_checkpoint_of_the_same_network_only(config, tmp_path, capsys):

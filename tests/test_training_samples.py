@@ -12,6 +12,7 @@ import torch
 from recordings import JAZZY, SAMPLE, Entry, changed, sample_entries, write_rosbag2
 
 from cvcdepth_core.checkpoint import DepthModelSpec
+from cvcdepth_core.distributed import Processes
 from cvcdepth_core.errors import RecordingError, RigError
 from cvcdepth_core.preprocess import SurroundPreprocessor
 from cvcdepth_core.training_config import OptimizerConfig, RecordingsConfig, TrainingConfig
@@ -187,6 +188,23 @@ def test_every_batch_is_of_one_rig(index):
     batches = RecordingBatches([index, build_index(SAMPLE, MATCHING, three)], config(samples_per_batch=3))
     names = [tuple(batch.camera_names) for batch in batches.epoch(0)]
     assert sorted(map(len, names)) == [3, 3, 3, 6, 6, 6]
+
+
+def test_processes_share_an_epoch_and_none_is_left_without_a_batch(index):
+    with open_recording(SAMPLE) as recording:
+        layout = discover_rig(recording)
+    three = layout.model_copy(update={"cameras": layout.cameras[:3]})
+    indexes = [index, build_index(SAMPLE, MATCHING, three)]
+    shares = [RecordingBatches(indexes, config(), Processes(rank, 3)) for rank in range(3)]
+    parts = []
+    for share in shares:
+        list(share.epoch(4))
+        parts.append(share._order.batches)
+    together = [list(chain.from_iterable(batches)) for batches in zip(*parts, strict=True)]
+    assert [len(samples) for samples in together] == [3] * 6
+    assert sorted(set(chain.from_iterable(together))) == list(range(16))
+    whole = RecordingBatches(indexes, config(samples_per_batch=3))
+    assert [set(samples) for samples in together] == [set(samples) for samples in whole._shuffled(4)]
 
 
 def test_a_damaged_image_costs_its_samples_only(tmp_path):

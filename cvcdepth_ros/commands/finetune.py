@@ -12,6 +12,7 @@ from cvcdepth_ros.commands.arguments import add_json, add_quiet, add_recordings,
 from cvcdepth_ros.version import package_version
 
 if TYPE_CHECKING:
+    from cvcdepth_core.distributed import Processes
     from cvcdepth_core.training import Trainer
     from cvcdepth_core.training_config import TrainingConfig
     from cvcdepth_ros.training_index import RecordingIndex
@@ -45,21 +46,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(arguments: argparse.Namespace) -> None:
-    """Index the recordings and train; CvcDepthError says why not."""
+    """Index the recordings and train, with the other processes that torchrun started; CvcDepthError says why not."""
+    from cvcdepth_core.distributed import launched_processes
+
+    with launched_processes() as processes:
+        _finetune(arguments, processes)
+
+
+def _finetune(arguments: argparse.Namespace, processes: "Processes") -> None:
     from cvcdepth_core.training_config import load_training_config
     from cvcdepth_ros.training_samples import RecordingBatches
 
     config = load_training_config(arguments.config)
     if config.dataset != "recording":
         raise ConfigError(f"{arguments.config}: dataset is {config.dataset!r}, finetune takes 'recording'")
-    indexes, left_out = _indexes(arguments, config)
-    batches = RecordingBatches(indexes, config)
-    trainer = _trainer(arguments, config, batches)
+    with processes.first_goes_ahead():
+        indexes, left_out = _indexes(arguments, config)
+    batches = RecordingBatches(indexes, config, processes)
+    trainer = _trainer(arguments, config, batches, processes)
     try:
         trainer.train(quiet=arguments.quiet)
     except KeyboardInterrupt:
         warn(f"interrupted in step {trainer.progress.step + 1}; the same command goes on from the last checkpoint")
         raise
+    if not processes.is_first:
+        return
     result = _result(arguments, trainer, batches, indexes) | {"left_out": left_out}
     (arguments.output / _RESULT_FILE).write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
     print_result(result, _text(result), arguments.json)
@@ -87,8 +98,11 @@ def _indexes(arguments: argparse.Namespace, config: "TrainingConfig") -> "tuple[
     return indexes, left_out
 
 
-def _trainer(arguments: argparse.Namespace, config: "TrainingConfig", batches: "RecordingBatches") -> "Trainer":
+def _trainer(
+    arguments: argparse.Namespace, config: "TrainingConfig", batches: "RecordingBatches", processes: "Processes"
+) -> "Trainer":
     from cvcdepth_core.checkpoint import load_checkpoint
+    from cvcdepth_core.distributed import own_device
     from cvcdepth_core.estimator import resolve_device
     from cvcdepth_core.training import Trainer, build_surround_model
 
@@ -98,12 +112,13 @@ def _trainer(arguments: argparse.Namespace, config: "TrainingConfig", batches: "
         build_surround_model(config, start),
         batches,
         arguments.output,
-        resolve_device(arguments.device),
+        own_device(resolve_device(arguments.device)),
         metadata={
             "version": package_version(),
             "config": config.model_dump_json(),
             "start": "random weights" if start is None else f"{start.path.name} sha256:{start.sha256}",
         },
+        processes=processes,
     )
 
 
