@@ -4,33 +4,42 @@
 The file is seen as blocks (a chunk, or a message outside of chunks) that can be read alone. An intact file's index
 says where they are; a file without one (cut by a power loss, or still being written) is scanned once from its
 beginning. Either way a block that cannot be read, or whose checksum is wrong, is skipped and reported.
+
+Memory is bounded whatever a file declares: no block is larger than `MAX_BLOCK_BYTES` once it is unpacked, and those
+that overlap in time, which must be held together, are no larger in all.
 """
 
 import io
 import struct
 from collections import Counter
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import IO, NamedTuple
 
+import lz4.frame  # type: ignore[import-untyped]
+import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.reader import SeekingReader
-from mcap.records import Channel, Chunk, McapRecord, Message, Schema
-from mcap.stream_reader import breakup_chunk
+from mcap.records import Channel, Chunk, ChunkIndex, Footer, McapRecord, Message, Schema, Statistics
+from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.summary import Summary
-from zstandard import ZstdError
 
 from cvcdepth_ros.bags.ordering import Source, in_time_order
 from cvcdepth_ros.bags.remote import Location
 from cvcdepth_ros.bags.topics import RecordedMessage, RecordingFile, Topic, joined_topics, recorded_qos
 
 MAGIC = b"\x89MCAP0\r\n"
+MAX_BLOCK_BYTES = 256 * 2**20
+"""Of a record, or of an unpacked chunk; recorders write chunks of 1 to 16 MiB, longer only for a longer message."""
+MAX_BLOCK_RECORDS = 2**20
+_FOOTER_BYTES = 37  # the footer record and the magic after it
+_MESSAGE_BYTES = 256  # what an object takes beside its content
+_NEEDED = (Opcode.CHUNK, Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL)
 _RECORD_HEADER = struct.Struct("<BQ")  # opcode, length of what follows
 # What mcap and the decompressors raise on damaged bytes (lz4: RuntimeError; wrong CRC and text: ValueError).
-_DAMAGE = (McapError, ZstdError, struct.error, ValueError, RuntimeError, KeyError, OverflowError, MemoryError)
+_DAMAGE = (McapError, zstandard.ZstdError, struct.error, ValueError, RuntimeError, KeyError, OverflowError, MemoryError)
 
 
 class _Block(NamedTuple):
@@ -63,6 +72,7 @@ class McapFile(RecordingFile):
         self.start = min((block.start for block in self._index.blocks), default=None)
         self.end = max((block.end for block in self._index.blocks), default=None)
         self.topics = joined_topics([*self._channel_topics()], path)
+        self._held = 0
 
     def messages(self, topics: Collection[str], start: int, stop: int) -> Iterator[RecordedMessage]:
         """Give the messages of `topics` with start <= log_time < stop, in time order."""
@@ -85,22 +95,46 @@ class McapFile(RecordingFile):
             for record in self._intact_records(stream, block.offset)
             if isinstance(record, Message) and record.channel_id in wanted
         ]
-        return iter(sorted(found, key=lambda message: message.log_time))
+        size = sum(len(message.cdr) + _MESSAGE_BYTES for message in found)
+        if self._held + size > MAX_BLOCK_BYTES:
+            self._report(f"chunk at byte {block.offset} skipped: more than {MAX_BLOCK_BYTES} bytes at the same time")
+            return
+        self._held += size
+        try:
+            yield from sorted(found, key=lambda message: message.log_time)
+        finally:
+            self._held -= size
 
     def _indexed(self, stream: IO[bytes]) -> _Index | None:
         """Read the index at the end of the file; None when there is none or it does not cover all messages."""
         stream.seek(max(0, self.size - len(MAGIC)))
         if stream.read() != MAGIC:
             return None
-        stream.seek(0)
         try:
-            summary = SeekingReader(stream).get_summary()
+            summary = self._summary(stream)
         except _DAMAGE as error:
             self._report("index unreadable", error)
             return None
         if summary is None or not _is_complete(summary):
             return None
         return _index_of(summary)
+
+    def _summary(self, stream: IO[bytes]) -> Summary | None:
+        """Collect the records of the index; a chunk, which has no place there, is not unpacked."""
+        stream.seek(max(0, self.size - _FOOTER_BYTES))
+        footer = next(_records(stream.read()))
+        if not isinstance(footer, Footer):
+            raise McapError(f"{type(footer).__name__} in place of the footer")
+        if not footer.summary_start:
+            return None
+        length = self.size - footer.summary_start
+        if not 0 < length <= MAX_BLOCK_BYTES:
+            raise McapError(f"of {length} bytes")
+        stream.seek(footer.summary_start)
+        summary = Summary()
+        for record in _records(stream.read(length)):
+            _add_to_summary(summary, record)
+        return summary
 
     def _scanned(self, stream: IO[bytes]) -> _Index:
         """Walk through the records from the beginning and index what is whole."""
@@ -140,14 +174,15 @@ class McapFile(RecordingFile):
         if header is None:
             raise McapError("no whole record there")
         opcode, length = header
+        if opcode not in _NEEDED:
+            return []
+        _check_size(length)
         body = ReadDataStream(io.BytesIO(stream.read(length)))
         if opcode == Opcode.CHUNK:
             return _chunk_records(Chunk.read(body))
         if opcode == Opcode.MESSAGE:
             return [Message.read(body, length)]
-        if opcode == Opcode.SCHEMA:
-            return [Schema.read(body)]
-        return [Channel.read(body)] if opcode == Opcode.CHANNEL else []
+        return [Schema.read(body) if opcode == Opcode.SCHEMA else Channel.read(body)]
 
     def _channel_topics(self) -> Iterator[Topic]:
         """Give a topic for every readable channel; the others are reported."""
@@ -171,6 +206,7 @@ def _is_complete(summary: Summary) -> bool:
     return (
         statistics is not None
         and len(summary.chunk_indexes) == statistics.chunk_count
+        and len({chunk.chunk_start_offset for chunk in summary.chunk_indexes}) == statistics.chunk_count
         and (statistics.chunk_count > 0 or statistics.message_count == 0)
         and statistics.channel_message_counts.keys() <= summary.channels.keys()
         and {channel.schema_id for channel in summary.channels.values()} <= summary.schemas.keys() | {0}
@@ -208,7 +244,53 @@ def _add_records(index: _Index, offset: int, records: list[McapRecord]) -> None:
         index.blocks.append(_Block(min(messages)[0], max(messages)[0], offset, frozenset(channels)))
 
 
+def _records(section: bytes) -> Iterator[McapRecord]:
+    return StreamReader(io.BytesIO(section), skip_magic=True, emit_chunks=True).records
+
+
+def _add_to_summary(summary: Summary, record: McapRecord) -> None:
+    if isinstance(record, Statistics):
+        summary.statistics = record
+    elif isinstance(record, Schema):
+        summary.schemas[record.id] = record
+    elif isinstance(record, Channel):
+        summary.channels[record.id] = record
+    elif isinstance(record, ChunkIndex):
+        summary.chunk_indexes.append(record)
+
+
 def _chunk_records(chunk: Chunk) -> list[McapRecord]:
-    if not chunk.compression and len(chunk.data) != chunk.uncompressed_size:
-        raise McapError(f"holds {len(chunk.data)} bytes, announces {chunk.uncompressed_size}")
-    return breakup_chunk(chunk, validate_crc=True)
+    _check_size(chunk.uncompressed_size)
+    content = _unpacked(chunk)
+    if len(content) != chunk.uncompressed_size:
+        raise McapError(f"holds {len(content)} bytes, announces {chunk.uncompressed_size}")
+    _check_number(content)
+    return breakup_chunk(replace(chunk, compression="", data=content), validate_crc=True)
+
+
+def _unpacked(chunk: Chunk) -> bytes:
+    """Decompress a chunk into no more memory than it announces, whatever is packed in it."""
+    if chunk.compression == "zstd":
+        if zstandard.frame_content_size(chunk.data) > chunk.uncompressed_size:
+            raise McapError(f"unpacks to more than the {chunk.uncompressed_size} bytes that it announces")
+        return zstandard.decompress(chunk.data, chunk.uncompressed_size)
+    if chunk.compression == "lz4":
+        unpacked: bytes = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, chunk.uncompressed_size)
+        return unpacked
+    return chunk.data
+
+
+def _check_number(content: bytes) -> None:
+    """Refuse to make millions of objects out of one chunk."""
+    position = 0
+    for _ in range(MAX_BLOCK_RECORDS):
+        if position >= len(content):
+            return
+        _, length = _RECORD_HEADER.unpack_from(content, position)
+        position += _RECORD_HEADER.size + length
+    raise McapError(f"more than {MAX_BLOCK_RECORDS} records")
+
+
+def _check_size(length: int) -> None:
+    if length > MAX_BLOCK_BYTES:
+        raise McapError(f"{length} bytes; at most {MAX_BLOCK_BYTES} are read at once")
