@@ -41,7 +41,10 @@ setup(
     ],
     # numpy 2 works with torch from 2.3 on.
     install_requires=["torch>=2.3", *requirements("core")],
-    extras_require={"ros-jazzy": requirements("ros"), "s3": requirements("s3"), "report": requirements("report")},
+    extras_require={
+        "ros-jazzy": requirements("ros"),
+        **{name: requirements(name) for name in ("s3", "report", "fleet")},
+    },
     zip_safe=True,
     entry_points={
         "console_scripts": [

@@ -5,7 +5,7 @@ import argparse
 import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -24,12 +24,12 @@ from cvcdepth_ros.commands.arguments import (
     warn,
 )
 from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings
-from cvcdepth_ros.version import package_version
 
 if TYPE_CHECKING:
     from cvcdepth_core.scores import Score
     from cvcdepth_ros.evaluation.recording import Progress, RecordingScores
-    from cvcdepth_ros.evaluation.result import EvaluationResult, Model
+    from cvcdepth_ros.evaluation.result import EvaluationResult
+    from cvcdepth_ros.evaluation.workers import Pool
 
 SUMMARY = """Score depth on recordings: against their LiDAR, and without it; or compare two results.
 
@@ -73,7 +73,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--base-frame", metavar="FRAME", default="base_link", help="without --rig: the vehicle's frame [base_link]"
     )
     add_window(parser)
-    parser.add_argument("--workers", type=_workers, default=1, metavar="N", help="processes, a recording each [1]")
+    parser.add_argument(
+        "--workers", type=_workers, metavar="N", help="processes, a recording each [1; with --ray as many as CPUs]"
+    )
+    parser.add_argument("--ray", action="store_true", help="hand the recordings to Ray, on a cluster started here")
+    parser.add_argument("--ray-address", metavar="ADDRESS", help="... on the cluster there, as many as its CPUs take")
     parser.add_argument("--no-report", action="store_true", help=f"numbers only, no {_REPORT_FILE}")
     add_quiet(parser)
     add_json(parser)
@@ -85,6 +89,8 @@ def execute(arguments: argparse.Namespace) -> None:
         arguments.usage_error("--compare takes two metrics.json and no recording")
     if not arguments.compare and not arguments.recordings:
         arguments.usage_error("the following arguments are required: BAG")
+    if arguments.ray_address and arguments.workers:
+        arguments.usage_error("--workers is for this machine; of a cluster (--ray-address) all CPUs are used")
     if arguments.compare:
         content, text = _comparison(*arguments.compare)
     else:
@@ -153,14 +159,14 @@ def _is_drawable() -> bool:
 def _result(
     arguments: argparse.Namespace, settings: EvaluationSettings, jobs: Sequence[EvaluationJob], folder: Path
 ) -> "EvaluationResult":
-    from cvcdepth_ros.evaluation.result import EvaluationResult, Failure
+    from cvcdepth_ros.evaluation.result import EvaluationResult, Failure, Model
     from cvcdepth_ros.evaluation.workers import KeptParts, evaluate_all
 
-    model = _model(settings)
-    kept = KeptParts(folder / _PARTS, {"version": package_version(), "sha256": model.sha256})
+    depends_on = settings.dependencies()
+    kept = KeptParts(folder / _PARTS, depends_on)
     scores, failed = [], []
-    with _progress(len(jobs), arguments.quiet) as progress:
-        for job, outcome in evaluate_all(jobs, arguments.workers, kept, progress):
+    with _pool(arguments, settings) as pool, _progress(len(jobs), arguments.quiet) as progress:
+        for job, outcome in evaluate_all(jobs, arguments.workers or 1, kept, progress, pool):
             if isinstance(outcome, Failure):
                 failed.append(outcome)
             else:
@@ -170,9 +176,18 @@ def _result(
         warn(f"not evaluated: {failure.reason}")
     if not scores:
         raise RecordingError(f"nothing could be evaluated: {failed[0].reason}")
-    model = model._replace(id=scores[0].summary["model"])
+    model = Model(scores[0].summary["model"], settings.checkpoint or None, depends_on.sha256)
     ordered = sorted(scores, key=lambda found: found.name)
-    return EvaluationResult(package_version(), model, jobs[0].configuration(), ordered, sorted(failed))
+    return EvaluationResult(depends_on.version, model, jobs[0].configuration(), ordered, sorted(failed))
+
+
+def _pool(arguments: argparse.Namespace, settings: EvaluationSettings) -> "AbstractContextManager[Pool | None]":
+    """Return where recordings are evaluated at the same time, when it is not this machine's processes."""
+    if not arguments.ray and not arguments.ray_address:
+        return nullcontext()
+    from cvcdepth_ros.evaluation.cluster import ray_pool
+
+    return ray_pool(settings, arguments.ray_address, arguments.workers)
 
 
 def _jobs(arguments: argparse.Namespace, settings: EvaluationSettings) -> list[EvaluationJob]:
@@ -185,17 +200,6 @@ def _jobs(arguments: argparse.Namespace, settings: EvaluationSettings) -> list[E
     lidar = () if arguments.no_lidar else tuple(arguments.lidar) if arguments.lidar else None
     job = EvaluationJob("", "", settings, layout, arguments.base_frame, lidar, arguments.start, arguments.duration)
     return [replace(job, name=name, path=str(path)) for name, path in zip(names, locations, strict=True)]
-
-
-def _model(settings: EvaluationSettings) -> "Model":
-    """Look at the checkpoint before the work begins; CheckpointError says what is wrong with it."""
-    from cvcdepth_core.checkpoint import load_checkpoint
-    from cvcdepth_ros.evaluation.result import Model
-
-    if not settings.checkpoint:
-        return Model("", None, None)
-    path = Path(settings.checkpoint).expanduser()
-    return Model("", str(path), load_checkpoint(path).sha256)
 
 
 def _comparison(first: Path, second: Path) -> tuple[dict[str, Any], str]:

@@ -4,17 +4,28 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from pydantic import Field, model_validator
 
 from cvcdepth_ros.settings import MatchingSettings, ModelSettings
+from cvcdepth_ros.version import package_version
 
 if TYPE_CHECKING:
     from cvcdepth_core.estimator import DepthPredictor
     from cvcdepth_core.ground_truth import OcclusionFilter
     from cvcdepth_core.rig import Rig, RigLayout
     from cvcdepth_core.scores import ScoreSettings
+
+
+class Dependencies(NamedTuple):
+    """What scores depend on beside recording and configuration."""
+
+    version: str
+    """Of this program."""
+    sha256: str | None
+    """Hash of the checkpoint's bytes; None without one."""
 
 
 class EvaluationSettings(MatchingSettings, ModelSettings):
@@ -56,6 +67,13 @@ class EvaluationSettings(MatchingSettings, ModelSettings):
         from cvcdepth_core.ground_truth import OcclusionFilter
 
         return None if self.no_occlusion_filter else OcclusionFilter()
+
+    def dependencies(self) -> Dependencies:
+        """Look at what this machine has; CheckpointError says what is wrong with the checkpoint."""
+        from cvcdepth_core.checkpoint import load_checkpoint
+
+        path = Path(self.checkpoint).expanduser() if self.checkpoint else None
+        return Dependencies(package_version(), load_checkpoint(path).sha256 if path else None)
 
     def build_predictor(self, rig: Rig) -> DepthPredictor:
         """Load the network, or make the reference for this rig; the errors of the family say what is wrong."""
