@@ -13,6 +13,9 @@ from cvcdepth_core.errors import ConfigError
 from cvcdepth_core.metrics import METRIC_NAMES
 from cvcdepth_core.scores import ALL, Scaling, Scores
 
+SetValues = dict[tuple[str, int], NDArray[np.float64]]
+"""The numbers [N, M] of N cameras by (recording, stamp) of the set; NaN where there is none."""
+
 _LEAST_SETS = 2
 _BLOCKS_AT_LEAST = 4
 
@@ -36,7 +39,7 @@ class Comparison:
     """Two results compared."""
 
     differences: dict[str, Difference]
-    """By `METRIC_NAMES`."""
+    """By the names of what was compared: `METRIC_NAMES`."""
     sets: int
     """Surround sets that both results have."""
     only_in_first: int
@@ -70,17 +73,35 @@ def compare(
         raise ConfigError(f"comparison: {first.settings} and {second.settings} cannot be compared")
     if sorted(first.cameras) != sorted(second.cameras):
         raise ConfigError(f"comparison: cameras {first.cameras} and {second.cameras} differ")
-    values = [set_metrics(scores, first.cameras, scaling, group) for scores in (first, second)]
-    common = sorted(values[0].keys() & values[1].keys())
+    before, after = (set_metrics(scores, first.cameras, scaling, group) for scores in (first, second))
+    return compare_values(before, after, METRIC_NAMES, level=level, resamples=resamples, block=block, seed=seed)
+
+
+def compare_values(
+    first: SetValues,
+    second: SetValues,
+    names: Sequence[str],
+    *,
+    level: float = 0.95,
+    resamples: int = 2000,
+    block: int = 10,
+    seed: int = 0,
+) -> Comparison:
+    """Compare numbers of any kind, called `names`, over the sets that both have; see `compare`.
+
+    Raises ConfigError when fewer than two sets are common.
+    """
+    common = sorted(first.keys() & second.keys())
     if len(common) < _LEAST_SETS:
         raise ConfigError(f"comparison: {len(common)} sets in common, want {_LEAST_SETS} or more")
     block = max(1, min(block, len(common) // _BLOCKS_AT_LEAST))
-    paired = np.stack([np.stack([found[key] for key in common]) for found in values])
+    paired = np.stack([np.stack([values[key] for key in common]) for values in (first, second)])
+    counts = _resampled_counts(len(common), block, resamples, seed)
     return Comparison(
-        differences=_differences(paired, _resampled_counts(len(common), block, resamples, seed), level),
+        differences=_differences(paired, counts, level, names),
         sets=len(common),
-        only_in_first=len(values[0]) - len(common),
-        only_in_second=len(values[1]) - len(common),
+        only_in_first=len(first) - len(common),
+        only_in_second=len(second) - len(common),
         level=level,
         resamples=resamples,
         block=block,
@@ -88,9 +109,7 @@ def compare(
     )
 
 
-def set_metrics(
-    scores: Scores, cameras: Sequence[str], scaling: Scaling = "metric", group: str = ALL
-) -> dict[tuple[str, int], NDArray[np.float64]]:
+def set_metrics(scores: Scores, cameras: Sequence[str], scaling: Scaling = "metric", group: str = ALL) -> SetValues:
     """Return each set's metrics [N, 7] by (recording, stamp), in the order of `cameras`; NaN without truth."""
     index = {camera: i for i, camera in enumerate(cameras)}
     found: dict[tuple[str, int], NDArray[np.float64]] = {}
@@ -127,17 +146,19 @@ def _resampled_counts(sets: int, block: int, resamples: int, seed: int) -> NDArr
     return np.stack([np.bincount(sample, minlength=sets) for sample in drawn]).astype(np.float64)
 
 
-def _differences(paired: NDArray[np.float64], counts: NDArray[np.float64], level: float) -> dict[str, Difference]:
-    """Return the differences of `paired` [2, sets, N, 7], with intervals over resampled `counts` [resamples, sets]."""
+def _differences(
+    paired: NDArray[np.float64], counts: NDArray[np.float64], level: float, names: Sequence[str]
+) -> dict[str, Difference]:
+    """Return the differences of `paired` [2, sets, N, M], with intervals over resampled `counts` [resamples, sets]."""
     first, second = (_weighted_means(values, np.ones((1, len(values))))[0] for values in paired)
     resampled = _weighted_means(paired[1], counts) - _weighted_means(paired[0], counts)
     low, high = np.nanquantile(resampled, [(1 - level) / 2, (1 + level) / 2], axis=0)
     columns = zip(first, second, second - first, low, high, strict=True)
-    return {name: Difference(*map(float, row)) for name, row in zip(METRIC_NAMES, columns, strict=True)}
+    return {name: Difference(*map(float, row)) for name, row in zip(names, columns, strict=True)}
 
 
 def _weighted_means(values: NDArray[np.float64], counts: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return means [R, 7] of `values` [sets, N, 7]: over the sets, each `counts` [R, sets] times, then the cameras."""
+    """Return means [R, M] of `values` [sets, N, M]: over the sets, each `counts` [R, sets] times, then the cameras."""
     flat = values.reshape(len(values), -1)
     known = ~np.isnan(flat)
     weights = counts @ known
