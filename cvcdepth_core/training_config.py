@@ -110,6 +110,10 @@ class EvaluationConfig(_Section):
     """Metres; ground truth at or beyond it is left out, predictions are clamped to it."""
     flip_fusion: bool = False
     """Predict the mirrored image too and fuse both depths ("pp")."""
+    sets: int = Field(default=20, ge=2)
+    """Held-out sets, at most, that a validation during the run scores; at its start and end all are scored."""
+    patience: int | None = Field(default=None, ge=1)
+    """Validations in a row without a better score after which the run ends; null: it never ends early."""
 
 
 class TrainingConfig(_Section):
