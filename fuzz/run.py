@@ -3,15 +3,16 @@
 
     python fuzz/run.py recordings --seconds 3600
 
-An input that crashes, takes more than a second of CPU time or more than 1 GiB is left in `fuzz/findings`, and the run
-ends there. What reaches new code is kept in `--corpus` (not in the repository's, whose inputs are only read).
+An input that raises, crashes, takes more than a second of CPU time or more than 1 GiB is left in `fuzz/findings`, and
+the run ends there. What reaches new code is kept in `--corpus` (not in the repository's, whose inputs are only read).
 """
 
 import argparse
-import hashlib
+import mmap
 import resource
 import sys
 import time
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 
@@ -41,7 +42,9 @@ def main() -> None:
         "-seed=1",
     ]
     folders = [str(arguments.corpus), str(HERE / "corpus" / arguments.target)]
-    atheris.Setup([sys.argv[0], *options, *folders], _watched(arguments.target))
+    atheris.Setup(
+        [sys.argv[0], *options, *folders], _watched(arguments.target, arguments.max_len, arguments.keep_going)
+    )
     atheris.Fuzz()
 
 
@@ -51,22 +54,34 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--seconds", type=int, default=60)
     parser.add_argument("--max-len", type=int, default=32768, help="bytes of the longest input")
     parser.add_argument("--corpus", type=Path, default=HERE / "found", help="what reaches new code is kept there")
+    parser.add_argument("--keep-going", action="store_true", help="go on after a finding, but keep one of each kind")
     return parser.parse_args()
 
 
-def _watched(name: str) -> Callable[[bytes], None]:
-    """Run the target; keep an input that fails, is slow or takes memory, since atheris' wheel cannot, and raise."""
-    target = targets.TARGETS[name]
+def _watched(name: str, max_len: int, keep_going: bool) -> Callable[[bytes], None]:
+    """Run the target; an input that fails, hangs, is slow or takes memory is left in `findings`.
+
+    The input is written there through a memory map before it is tried: it stays when the process is killed.
+    """
+    target, findings = targets.TARGETS[name], HERE / "findings"
+    running = findings / f"{name}_running"
+    running.write_bytes(bytes(4 + max_len))
+    with running.open("r+b") as file:
+        current = mmap.mmap(file.fileno(), 0)
     memory_at_start = _peak_mebibytes()
 
     def run(content: bytes) -> None:
+        current[: 4 + len(content)] = len(content).to_bytes(4, "little") + content
         begin = time.process_time()
         try:
             target(content)
             _check(time.process_time() - begin, _peak_mebibytes() - memory_at_start)
-        except BaseException:
-            (HERE / "findings" / f"{name}_{hashlib.sha256(content).hexdigest()[:12]}").write_bytes(content)
-            raise
+        except Exception as error:
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            kind = f"{type(error).__name__}_{Path(place.filename).stem}_{place.lineno}"
+            (findings / f"{name}_{kind}").write_bytes(content)
+            if not keep_going:
+                raise
 
     return run
 
