@@ -48,6 +48,18 @@ def test_only_the_chunks_of_the_time_that_is_asked_for_are_fetched(url: str, s3:
     assert 0.1 * SIZE < s3.sent - before < 0.5 * SIZE
 
 
+def test_a_window_that_is_read_again_is_not_fetched_again(url: str, s3: LocalS3):
+    with open_recording(url) as recording:
+        window = {"start": recording.start + 400_000_000, "stop": recording.start + 500_000_000}
+        first = list(recording.messages(**window))
+        before = s3.sent
+        assert list(recording.messages(**window)) == first
+        assert s3.sent == before
+        cameras = [topic for topic in recording.topics if topic.endswith("compressed")]
+        assert list(recording.messages(cameras, **window)) == [m for m in first if m.topic in cameras]
+        assert s3.sent == before
+
+
 def test_a_window_of_a_recording_behind_a_url_is_inspected_for_less_than_the_whole(
     url: str, s3: LocalS3, capsys: pytest.CaptureFixture[str]
 ):

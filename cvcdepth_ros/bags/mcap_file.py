@@ -12,9 +12,10 @@ that overlap in time, which must be held together, are no larger in all.
 import io
 import struct
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cache, partial
 from typing import IO, NamedTuple
 
 import lz4.frame  # type: ignore[import-untyped]
@@ -27,7 +28,8 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.summary import Summary
 
 from cvcdepth_ros.bags.ordering import Source, in_time_order
-from cvcdepth_ros.bags.remote import Location
+from cvcdepth_ros.bags.recent_blocks import MESSAGE_BYTES, RecentBlocks
+from cvcdepth_ros.bags.remote import Location, RemotePath
 from cvcdepth_ros.bags.topics import RecordedMessage, RecordingFile, Topic, joined_topics, recorded_qos
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -35,7 +37,8 @@ MAX_BLOCK_BYTES = 256 * 2**20
 """Of a record, or of an unpacked chunk; recorders write chunks of 1 to 16 MiB, longer only for a longer message."""
 MAX_BLOCK_RECORDS = 2**20
 _FOOTER_BYTES = 37  # the footer record and the magic after it
-_MESSAGE_BYTES = 256  # what an object takes beside its content
+# A window is asked for again and again: for transforms, for CameraInfo, for the pictures of every training sample.
+_recent = RecentBlocks(80 * 2**20)
 _NEEDED = (Opcode.CHUNK, Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL)
 _RECORD_HEADER = struct.Struct("<BQ")  # opcode, length of what follows
 # What mcap and the decompressors raise on damaged bytes (lz4: RuntimeError; wrong CRC and text: ValueError).
@@ -48,6 +51,8 @@ class _Block(NamedTuple):
     offset: int
     channels: frozenset[int]
     """Ids of the channels with messages in it; empty when the index does not say."""
+    packed: bool = True
+    """Whether it is compressed; so it counts where no index says that it is not."""
 
 
 @dataclass
@@ -64,6 +69,7 @@ class McapFile(RecordingFile):
 
     def __init__(self, path: Location) -> None:
         super().__init__(path)
+        self._key = object()
         with path.open("rb") as stream:
             self.size = stream.seek(0, io.SEEK_END)
             index = self._indexed(stream)
@@ -82,20 +88,23 @@ class McapFile(RecordingFile):
             for block in self._index.blocks
             if block.start < stop and block.end >= start and (not block.channels or block.channels & wanted.keys())
         ]
-        with self.path.open("rb") as stream:
+        with ExitStack() as opened:
+            stream = _opened_once(self.path, opened)
             for message in in_time_order(
                 Source(block.start, partial(self._block_messages, stream, block, wanted)) for block in blocks
             ):
                 if start <= message.log_time < stop:
                     yield message
 
-    def _block_messages(self, stream: IO[bytes], block: _Block, wanted: dict[int, str]) -> Iterator[RecordedMessage]:
+    def _block_messages(
+        self, stream: Callable[[], IO[bytes]], block: _Block, wanted: dict[int, str]
+    ) -> Iterator[RecordedMessage]:
         found = [
             RecordedMessage(wanted[record.channel_id], record.log_time, record.data)
-            for record in self._intact_records(stream, block.offset)
+            for record in self._block_records(stream, block)
             if isinstance(record, Message) and record.channel_id in wanted
         ]
-        size = sum(len(message.cdr) + _MESSAGE_BYTES for message in found)
+        size = sum(len(message.cdr) + MESSAGE_BYTES for message in found)
         if self._held + size > MAX_BLOCK_BYTES:
             self._report(f"chunk at byte {block.offset} skipped: more than {MAX_BLOCK_BYTES} bytes at the same time")
             return
@@ -104,6 +113,16 @@ class McapFile(RecordingFile):
             yield from sorted(found, key=lambda message: message.log_time)
         finally:
             self._held -= size
+
+    def _block_records(self, stream: Callable[[], IO[bytes]], block: _Block) -> Sequence[McapRecord]:
+        """Return what is in a block; what had to be fetched or unpacked is kept for the next time."""
+        key = self._key, block.offset
+        records = _recent.get(key)
+        if records is None:
+            records = self._intact_records(stream(), block.offset)
+            if block.packed or isinstance(self.path, RemotePath):
+                _recent.put(key, records)
+        return records
 
     def _indexed(self, stream: IO[bytes]) -> _Index | None:
         """Read the index at the end of the file; None when there is none or it does not cover all messages."""
@@ -200,6 +219,16 @@ class McapFile(RecordingFile):
             yield Topic(channel.topic, schema.name, count, qos, definition or None)
 
 
+def _opened_once(path: Location, opened: ExitStack) -> Callable[[], IO[bytes]]:
+    """Return a function that gives the file's stream, opened when it is first asked for and closed with `opened`."""
+
+    @cache
+    def stream() -> IO[bytes]:
+        return opened.enter_context(path.open("rb"))
+
+    return stream
+
+
 def _is_complete(summary: Summary) -> bool:
     """Say whether the index repeats all channels and knows all chunks; it may leave both out."""
     statistics = summary.statistics
@@ -221,6 +250,7 @@ def _index_of(summary: Summary) -> _Index:
             chunk.message_end_time,
             chunk.chunk_start_offset,
             frozenset(chunk.message_index_offsets),
+            bool(chunk.compression),
         )
         for chunk in summary.chunk_indexes
     ]
