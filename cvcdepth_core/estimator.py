@@ -105,14 +105,13 @@ class SurroundDepthEstimator:
     `preprocessor` holds what belongs to the rig: intrinsics and validity of the network's pictures.
     """
 
-    def __init__(self, rig: Rig, estimator: DepthPredictor) -> None:
+    def __init__(self, rig: Rig, estimator: DepthPredictor, known: "SurroundDepthEstimator | None" = None) -> None:
+        """`known` is an estimator whose maps are taken over for the cameras that have not changed."""
         self.rig = rig
         self.estimator = estimator
-        self.preprocessor = SurroundPreprocessor(rig, estimator.spec.height, estimator.spec.width)
-
-    def rectify(self, index: int, picture: Picture) -> Picture:
-        """Take the picture of the camera with this index in the rig to the network's view of it."""
-        return self.preprocessor.rectify(index, picture)
+        self.preprocessor: SurroundPreprocessor = SurroundPreprocessor(
+            rig, estimator.spec.height, estimator.spec.width, known.preprocessor if known else None
+        )
 
     def estimate(self, rectified: Sequence[Picture | None]) -> SurroundDepth:
         """Estimate one set from its rectified pictures [H, W, 3] in the rig's order, None where none is wanted.

@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Coloured point clouds from depth: float32 [..., 4] with x, y, z in metres and the colour packed as PCL packs it."""
 
+import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,6 +13,13 @@ from cvcdepth_core.estimator import SurroundDepth
 from cvcdepth_core.rig import Rig
 
 Cloud = NDArray[np.float32]
+
+_BLOCK_ROWS = 64
+_POINT = np.complex128  # 16 bytes: numpy moves whole points as quickly as numbers
+_BGR0 = [0, 2, 1, 1, 2, 0] if sys.byteorder == "little" else [0, 1, 1, 2, 2, 3]  # from channel, to byte, ...
+_VOXEL_BITS = 21  # of each coordinate in a voxel's number
+_TABLE_BITS = 20
+_GOLDEN = 0x9E3779B97F4A7C15  # 2^64 over the golden ratio: Fibonacci hashing (Knuth, TAOCP 3, 6.4)
 
 
 @dataclass(frozen=True)
@@ -22,6 +32,76 @@ class CloudLimits:
     """Metres from the camera along its axis; nearer points are left out."""
     max_range: float = float("inf")
     """Metres from the camera along its axis; farther points are left out."""
+    voxel: float = 0.0
+    """Edge in metres of the cubes of which each keeps one point; 0 keeps every point."""
+
+
+def organised_cloud(surround: SurroundDepth, camera: int) -> Cloud:
+    """Return one camera's cloud [H, W, 4] in its optical frame; x, y, z are NaN where depth is (REP 118)."""
+    depth = surround.depth[camera]
+    cloud = np.empty((*depth.shape, 4), dtype=np.float32)
+    view = _View(depth, surround.pictures[camera], np.linalg.inv(surround.intrinsics[camera]), np.zeros(3), stride=1)
+    for rows in view.blocks():
+        view.project(rows, cloud[rows])
+    return cloud
+
+
+def merged_cloud(surround: SurroundDepth, rig: Rig, limits: CloudLimits) -> Cloud:
+    """Return the points of all cameras with known depth inside `limits`, [M, 4] in the base frame."""
+    merged = np.empty((surround.depth[:, :: limits.stride, :: limits.stride].size, 4), dtype=np.float32)
+    end = 0
+    for camera in np.flatnonzero(surround.present).tolist():
+        base_T_camera = rig.cameras[camera].base_T_camera
+        rays = base_T_camera[:3, :3] @ np.linalg.inv(surround.intrinsics[camera])
+        depth, picture = surround.depth[camera], surround.pictures[camera]
+        view = _View(depth, picture, rays, base_T_camera[:3, 3], limits.stride)
+        for rows in view.blocks():
+            end += _append(view, rows, limits, merged[end:])
+    return thinned(merged[:end], limits.voxel) if limits.voxel else merged[:end]
+
+
+def _append(view: "_View", rows: slice, limits: CloudLimits, free: Cloud) -> int:
+    """Put the points of these rows that are inside the limits at the beginning of `free`; return how many they are."""
+    depth = view.depth[rows]
+    points = free[: depth.size]
+    view.project(rows, points.reshape(*depth.shape, 4))
+    inside = ((depth >= limits.min_range) & (depth <= limits.max_range)).ravel()
+    count = int(np.count_nonzero(inside))
+    if count < depth.size:
+        points[:count] = points.view(_POINT)[inside].view(np.float32)
+    return count
+
+
+class _View:
+    """One camera's pixels on their way to points, a few rows at a time, so that all steps stay in the cache."""
+
+    def __init__(
+        self,
+        depth: NDArray[np.float32],  # [H, W]
+        picture: NDArray[np.uint8],  # [H, W, 3]
+        rays: NDArray[np.float64],  # [3, 3], takes a pixel (u, v, 1) to its ray in the cloud's frame
+        origin: NDArray[np.float64],  # [3], the camera in the cloud's frame
+        stride: int,
+    ) -> None:
+        v, u = np.arange(0, depth.shape[0], stride), np.arange(0, depth.shape[1], stride)
+        self.depth = np.ascontiguousarray(depth[::stride, ::stride])
+        self._picture = np.ascontiguousarray(picture[::stride, ::stride])
+        self._across = (rays[:, :1] * u).astype(np.float32)[:, None, :]
+        self._down = (rays[:, 1:2] * v + rays[:, 2:]).astype(np.float32)[:, :, None]
+        self._origin = origin.astype(np.float32)[:, None, None]
+        self._planes = np.empty((3, _BLOCK_ROWS, len(u)), dtype=np.float32)
+
+    def blocks(self) -> Iterator[slice]:
+        """Give the rows of one block after the other."""
+        return (slice(begin, begin + _BLOCK_ROWS) for begin in range(0, len(self.depth), _BLOCK_ROWS))
+
+    def project(self, rows: slice, points: Cloud) -> None:
+        """Write the points of these rows into `points` [rows, W, 4]."""
+        depth = self.depth[rows]
+        xyz = np.add(self._across, self._down[:, rows], out=self._planes[:, : len(depth)])
+        np.multiply(xyz, depth, out=xyz)
+        np.add(xyz, self._origin, out=xyz)
+        cv2.merge([*xyz, pack_rgb(self._picture[rows])], dst=points)
 
 
 def pixel_rays(intrinsics: NDArray[np.float64], height: int, width: int) -> NDArray[np.float32]:
@@ -33,27 +113,37 @@ def pixel_rays(intrinsics: NDArray[np.float64], height: int, width: int) -> NDAr
 
 
 def pack_rgb(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Pack RGB [..., 3] into float32 [...] whose bits are 0x00RRGGBB, the `rgb` field that RViz and PCL read."""
-    channels = picture.astype(np.uint32)
-    packed = channels[..., 0] * 0x10000 + channels[..., 1] * 0x100 + channels[..., 2]
-    return packed.astype(np.uint32, copy=False).view(np.float32)
+    """Pack RGB [H, W, 3] into float32 [H, W] whose bits are 0x00RRGGBB, the `rgb` field that RViz and PCL read."""
+    packed = np.zeros((*picture.shape[:2], 4), dtype=np.uint8)
+    cv2.mixChannels([picture], [packed], _BGR0)
+    return packed.view(np.float32)[..., 0]
 
 
-def organised_cloud(surround: SurroundDepth, camera: int) -> Cloud:
-    """Return one camera's cloud [H, W, 4] in its optical frame; x, y, z are NaN where depth is (REP 118)."""
-    depth = surround.depth[camera]
-    xyz = pixel_rays(surround.intrinsics[camera], *depth.shape) * depth[..., None]
-    return np.concatenate([xyz, pack_rgb(surround.pictures[camera])[..., None]], axis=-1)
+def thinned(points: Cloud, edge: float) -> Cloud:
+    """Keep of the points [M, 4] the first in each cube of `edge` metres, in their order.
+
+    A hash table without chains: in every round each slot goes to one voxel, and those that did not get one try again.
+    """
+    voxels = _voxels(points, edge)
+    table = np.empty(1 << _TABLE_BITS, dtype=np.int64)
+    first = np.zeros(len(points), dtype=np.bool_)
+    left = np.arange(len(points))
+    factor = _GOLDEN
+    while left.size:
+        slots = voxels[left] * np.uint64(factor) >> np.uint64(64 - _TABLE_BITS)
+        table[slots[::-1]] = left[::-1]  # of equal slots the last assignment, the first point, stays
+        holders = table[slots]
+        first[holders] = True
+        left = left[voxels[holders] != voxels[left]]
+        factor = factor * _GOLDEN % 2**64
+    return points[first]
 
 
-def merged_cloud(surround: SurroundDepth, rig: Rig, limits: CloudLimits) -> Cloud:
-    """Return the points of all cameras with known depth inside `limits`, [M, 4] in the base frame."""
-    clouds = []
-    for index, camera in enumerate(rig.cameras):
-        cloud = organised_cloud(surround, index)[:: limits.stride, :: limits.stride].reshape(-1, 4)
-        depth = cloud[:, 2]
-        cloud = cloud[(depth >= limits.min_range) & (depth <= limits.max_range)]
-        base_T_camera = camera.base_T_camera.astype(np.float32)
-        cloud[:, :3] = cloud[:, :3] @ base_T_camera[:3, :3].T + base_T_camera[:3, 3]
-        clouds.append(cloud)
-    return np.concatenate(clouds)
+def _voxels(points: Cloud, edge: float) -> NDArray[np.uint64]:
+    """Give the cubes that the points lie in their numbers [M]."""
+    numbers = np.zeros(len(points), dtype=np.uint64)
+    mask = np.uint64(2**_VOXEL_BITS - 1)
+    for axis in range(3):
+        cells = np.floor(points[:, axis] * np.float32(1 / edge)).astype(np.int64).view(np.uint64)
+        numbers = numbers << np.uint64(_VOXEL_BITS) | cells & mask
+    return numbers

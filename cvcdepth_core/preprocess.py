@@ -8,7 +8,9 @@ samples of each network pixel are averaged: that keeps what the network's resolu
 
 import math
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -70,20 +72,38 @@ class SurroundPreprocessor:
     picture and where the vehicle itself is in view.
     """
 
-    def __init__(self, rig: Rig, height: int, width: int) -> None:
-        self.names = rig.names
-        self._rectifiers = [Rectifier(c.calibration, height, width, c.rectified) for c in rig.cameras]
-        self.intrinsics = np.stack([rectifier.intrinsics for rectifier in self._rectifiers])
-        self.valid: NDArray[np.bool_] = np.stack(
-            [
-                rectifier.visible & (self_occlusion_mask(camera, rectifier) > 0.5)
-                for camera, rectifier in zip(rig.cameras, self._rectifiers, strict=True)
-            ]
-        )
+    def __init__(self, rig: Rig, height: int, width: int, known: "SurroundPreprocessor | None" = None) -> None:
+        """Build the maps of every camera; those that `known` has for the same calibration and mask are taken over."""
+        keys = {camera.name: _view_key(camera, height, width) for camera in rig.cameras}
+        shared = known._views if known is not None else {}
+        self._views: dict[tuple[Any, ...], _View] = {
+            keys[camera.name]: shared.get(keys[camera.name]) or _view(camera, height, width) for camera in rig.cameras
+        }
+        views = {name: self._views[key] for name, key in keys.items()}
+        self.rectifiers = {name: view.rectifier for name, view in views.items()}
+        """By the cameras' names, in the rig's order."""
+        self.intrinsics = np.stack([rectifier.intrinsics for rectifier in self.rectifiers.values()])
+        self.valid: NDArray[np.bool_] = np.stack([view.valid for view in views.values()])
 
     def rectify(self, index: int, picture: Picture) -> Picture:
         """Rectify and resize one camera's picture, by its index in the rig."""
-        return self._rectifiers[index](picture, self.names[index])
+        name = list(self.rectifiers)[index]
+        return self.rectifiers[name](picture, name)
+
+
+class _View(NamedTuple):
+    rectifier: Rectifier
+    valid: NDArray[np.bool_]
+
+
+def _view(camera: Camera, height: int, width: int) -> _View:
+    rectifier = Rectifier(camera.calibration, height, width, camera.rectified)
+    return _View(rectifier, rectifier.visible & (self_occlusion_mask(camera, rectifier) > 0.5))
+
+
+def _view_key(camera: Camera, height: int, width: int) -> tuple[Any, ...]:
+    """Everything that the maps depend on: all of the camera but where it is mounted."""
+    return height, width, *(getattr(camera, f.name) for f in fields(camera) if f.name != "base_T_camera")
 
 
 def to_tensor(pictures: Sequence[Picture], device: torch.device | str = "cpu") -> torch.Tensor:

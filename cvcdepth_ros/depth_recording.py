@@ -14,7 +14,13 @@ from cvcdepth_ros.messages import bag_message_factory
 from cvcdepth_ros.recorded_rig import STATIC_TRANSFORMS
 from cvcdepth_ros.replay import EstimatedSet, Handlers, SurroundReplay
 from cvcdepth_ros.settings import OutputSettings
-from cvcdepth_ros.surround_messages import MERGED_CLOUD, POINT_CLOUD_TYPE, SurroundMessages, output_types
+from cvcdepth_ros.surround_messages import (
+    MERGED_CAMERAS,
+    MERGED_CLOUD,
+    POINT_CLOUD_TYPE,
+    SurroundMessages,
+    output_types,
+)
 from cvcdepth_ros.transforms import TransformTree, frame_name
 
 CloudChoice = Literal["merged", "all", "none"]
@@ -63,7 +69,7 @@ class DepthRecorder:
         """Write one set."""
         images, limits, frame_ids = estimated.images, self._settings.cloud_limits, self._replay.frame_ids
         for output in self._messages.of_set(
-            estimated.depth, estimated.rig, images.stamps_ns, frame_ids, limits, self._topics.__contains__
+            images, estimated.depth, estimated.rig, frame_ids, limits, self._topics.__contains__
         ):
             self._writer.write(f"{_NODE}/{output.topic}", images.images[output.camera].log_time, output.message)
 
@@ -107,4 +113,6 @@ class DepthRecorder:
 
 
 def _is_wanted(topic: str, type_: str, clouds: CloudChoice) -> bool:
-    return type_ != POINT_CLOUD_TYPE or clouds == "all" or (clouds == "merged" and topic == MERGED_CLOUD)
+    if topic in (MERGED_CLOUD, MERGED_CAMERAS):
+        return clouds != "none"
+    return type_ != POINT_CLOUD_TYPE or clouds == "all"

@@ -7,11 +7,20 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
+from cvcdepth_core.estimator import DepthEstimator
+from cvcdepth_ros.camera_states import CameraCondition, CameraState, CameraWatch
 from cvcdepth_ros.latencies import StageSummary
 from cvcdepth_ros.mailbox import MailboxStatistics
 from cvcdepth_ros.synchronizer import CameraStatistics, SynchronizerStatistics
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+
+_LEVELS = {
+    CameraState.OK: OK,
+    CameraState.REJECTED: ERROR,
+    CameraState.FROZEN: ERROR,
+    CameraState.STALE: ERROR,
+}
 
 
 def status(level: bytes, subject: str, message: str, values: Mapping[str, Any] | None = None) -> DiagnosticStatus:
@@ -20,21 +29,26 @@ def status(level: bytes, subject: str, message: str, values: Mapping[str, Any] |
     return DiagnosticStatus(level=level, name=subject, message=message, values=pairs)
 
 
-def camera_status(camera: str, problem: str | None, statistics: CameraStatistics, lost: int) -> DiagnosticStatus:
-    """One camera: why nothing comes of it, or how its images fared."""
+def camera_status(
+    camera: str, condition: CameraCondition, statistics: CameraStatistics, watch: CameraWatch, lost: int
+) -> DiagnosticStatus:
+    """One camera: its state and why, and how its images fared."""
+    silence = watch.seconds_since_image
     values = {
+        "state": condition.state.value,
         "received": statistics.received,
         "matched": statistics.matched,
         "queued": statistics.queued,
+        "sets without it": statistics.missed,
+        "refused": watch.refused,
+        "left out: frozen": watch.repeated,
         "lost in transport": lost,
         **{f"dropped: {reason}": count for reason, count in statistics.dropped.items()},
         "clock steps": statistics.clock_steps,
         "rate (Hz)": 1e9 / statistics.period_ns if statistics.period_ns else "unknown",
+        "seconds since last image": "never" if silence is None else silence,
     }
-    waiting = "waiting for images" if not statistics.received else None
-    trouble = problem or waiting
-    level = ERROR if problem else WARN if waiting else OK
-    return status(level, f"camera {camera}", trouble or "ok", values)
+    return status(_LEVELS.get(condition.state, WARN), f"camera {camera}", condition.text, values)
 
 
 def synchronisation_status(
@@ -46,14 +60,23 @@ def synchronisation_status(
     return status(OK if synchroniser.sets else WARN, "synchronisation", message, values)
 
 
-def latency_status(summaries: Mapping[str, StageSummary], level: bytes, message: str) -> DiagnosticStatus:
-    """How long each stage takes, in milliseconds."""
+def inference_status(
+    summaries: Mapping[str, StageSummary], mailbox: MailboxStatistics, problem: str, model_id: str
+) -> DiagnosticStatus:
+    """How long each stage takes, in milliseconds, and how many sets came too late or too early for the network."""
     values = {
         f"{stage} {name}": value
         for stage, summary in summaries.items()
         for name, value in (("p50 (ms)", summary.p50_ms), ("p95 (ms)", summary.p95_ms), ("max (ms)", summary.max_ms))
     }
-    return status(level, "inference", message, values)
+    misses = {"deadline misses": mailbox.replaced + mailbox.stale}
+    return status(ERROR if problem else OK, "inference", problem or model_id, values | misses)
+
+
+def model_status(estimator: DepthEstimator) -> DiagnosticStatus:
+    """Which network runs, and where."""
+    values = {"device": estimator.device, "height": estimator.spec.height, "width": estimator.spec.width}
+    return status(OK, "model", estimator.model_id, values)
 
 
 def _text(value: Any) -> str:

@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node's subscriptions: images, camera_info and static transforms, each with what can go wrong on its topic."""
 
-import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -24,17 +22,10 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from cvcdepth_core.errors import ConfigError
 from cvcdepth_core.rig import RigLayout
 from cvcdepth_ros.camera_discovery import COMPRESSED_IMAGE_TYPE, IMAGE_TYPE
+from cvcdepth_ros.camera_states import CameraState, Trouble
 
 _IMAGE_CLASSES = {IMAGE_TYPE: Image, COMPRESSED_IMAGE_TYPE: CompressedImage}
 _INPUT_DEPTH = 10
-
-
-@dataclass(frozen=True)
-class ReceivedImage:
-    """An image message and when it came in, on the monotonic clock."""
-
-    message: Any
-    received: float
 
 
 def topic_types(node: Node) -> dict[str, list[str]]:
@@ -50,7 +41,7 @@ class CameraInputs:
         node: Node,
         layout: RigLayout,
         reliable: bool,
-        on_image: Callable[[str, ReceivedImage], None],
+        on_image: Callable[[str, Any], None],
         on_camera_info: Callable[[str, Any], None],
     ) -> None:
         """Both callbacks get the camera's name first; they run on the executor's thread and must be short."""
@@ -72,18 +63,20 @@ class CameraInputs:
             known = [_IMAGE_CLASSES[name] for name in types.get(topic, ()) if name in _IMAGE_CLASSES]
             if camera not in self._connected and known:
                 self._connected.add(camera)
-                self._subscribe(camera, known[0], topic, partial(self._receive_image, camera))
+                self._subscribe(camera, known[0], topic, partial(self._on_image, camera))
 
-    def problems(self) -> Mapping[str, str]:
-        """Say for each camera why no image can arrive; cameras without such a reason are left out."""
+    def troubles(self) -> dict[str, list[Trouble]]:
+        """Say for each camera why no image can arrive."""
         types = topic_types(self._node)
         found = {
-            camera: self._image_problem(camera, topic, types.get(topic, []))
+            camera: self._image_troubles(camera, topic, types.get(topic, []))
             for camera, topic in self._image_topics.items()
         }
-        mismatches = {topic: self._qos_mismatch(topic) for topic in self._subscriptions}
-        found |= {self._cameras[topic]: text for topic, text in mismatches.items() if text}
-        return {camera: f"camera {camera}: {problem}" for camera, problem in found.items() if problem}
+        for topic, camera in self._cameras.items():
+            mismatch = self._qos_mismatch(topic)
+            if mismatch:
+                found[camera].append((CameraState.REJECTED, mismatch))
+        return found
 
     def close(self) -> None:
         """Drop all subscriptions."""
@@ -91,12 +84,13 @@ class CameraInputs:
             self._node.destroy_subscription(subscription)
         self._subscriptions.clear()
 
-    def _image_problem(self, camera: str, topic: str, types: list[str]) -> str:
+    def _image_troubles(self, camera: str, topic: str, types: list[str]) -> list[Trouble]:
         if not self._node.count_publishers(topic):
-            return f"no publisher on {topic}"
+            return [(CameraState.WAITING_FOR_IMAGES, f"no publisher on {topic}")]
         if camera not in self._connected:
-            return f"{topic} carries {', '.join(types)}, want {' or '.join(_IMAGE_CLASSES)}"
-        return ""
+            unusable = f"{topic} carries {', '.join(types)}, want {' or '.join(_IMAGE_CLASSES)}"
+            return [(CameraState.REJECTED, unusable)]
+        return []
 
     def _qos_mismatch(self, topic: str) -> str:
         """Compare with every publisher's QoS in the graph: rclpy's event for it was seen not to come."""
@@ -106,9 +100,6 @@ class CameraInputs:
             if compatibility == QoSCompatibility.ERROR:
                 return f"{topic}: QoS does not match: {reason} See the parameters reliable and qos_overrides."
         return ""
-
-    def _receive_image(self, camera: str, message: Any) -> None:
-        self._on_image(camera, ReceivedImage(message, time.monotonic()))
 
     def _subscribe(self, camera: str, message_class: type, topic: str, callback: Callable[[Any], None]) -> None:
         def message_lost(event: Any) -> None:

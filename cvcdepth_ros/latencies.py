@@ -7,9 +7,12 @@ from collections import defaultdict, deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from cvcdepth_ros.trace_file import TraceFile
 
 _WINDOW = 1000
 
@@ -26,9 +29,10 @@ class StageSummary:
 
 
 class StageLatencies:
-    """Rolling windows of durations, one per stage, and their sums. Thread-safe."""
+    """Rolling windows of durations, one per stage, and their sums; spans go into `trace` too. Thread-safe."""
 
-    def __init__(self) -> None:
+    def __init__(self, trace: TraceFile | None = None) -> None:
+        self._trace = trace
         self._windows: dict[str, deque[float]] = {}
         self._totals: defaultdict[str, float] = defaultdict(float)
         self._lock = threading.Lock()
@@ -44,7 +48,14 @@ class StageLatencies:
         """Record how long the block takes."""
         start = time.monotonic()
         yield
-        self.record(stage, time.monotonic() - start)
+        end = time.monotonic()
+        self.record(stage, end - start)
+        self.trace(stage, start, end)
+
+    def trace(self, name: str, start: float, end: float, **arguments: Any) -> None:
+        """Put a span between two times of `time.monotonic()` into the trace, if there is one, and there only."""
+        if self._trace is not None:
+            self._trace.span(name, start, end, **arguments)
 
     def summaries(self) -> dict[str, StageSummary]:
         """Return the percentiles of every stage, in the order in which the stages first came."""

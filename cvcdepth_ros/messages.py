@@ -116,6 +116,10 @@ class MessageFactory:
             is_dense=cloud.ndim == 2,
         )
 
+    def string(self, content: str) -> Any:
+        """Build the `std_msgs/String` with this content."""
+        return self._class("std_msgs/msg/String")(data=content)
+
     def static_transforms(self, stamp: int, base_frame: str, base_T_frames: dict[str, Pose]) -> Any:
         """Build the `/tf_static` message that hangs each frame under `base_frame`."""
         transforms = [

@@ -11,14 +11,14 @@ from rclpy.node import Node
 
 from cvcdepth_core.calibration import first_validation_message
 from cvcdepth_core.errors import ConfigError
-from cvcdepth_ros.settings import MatchingSettings, ModelSettings, OutputSettings
+from cvcdepth_ros.settings import MatchingSettings, MissingCameraSettings, ModelSettings, OutputSettings
 
 AUTO = "auto"
 
-CHANGEABLE_WHILE_RUNNING = ("cloud_stride", "cloud_min_range", "cloud_max_range")
+CHANGEABLE_WHILE_RUNNING = ("cloud_stride", "cloud_min_range", "cloud_max_range", "cloud_voxel")
 
 
-class NodeParameters(OutputSettings, MatchingSettings, ModelSettings):
+class NodeParameters(OutputSettings, MissingCameraSettings, MatchingSettings, ModelSettings):
     """Everything that can be set; the docstring of each field is its ROS description."""
 
     rig: str = ""
@@ -31,6 +31,12 @@ class NodeParameters(OutputSettings, MatchingSettings, ModelSettings):
     """Seconds (ROS time) after which a waiting set is not worth inference any more; 0 takes any age."""
     reliable: bool = False
     """Subscribe images and camera_info reliably instead of with sensor-data QoS."""
+    stale_after: float = Field(1.0, gt=0, le=3600)
+    """Seconds without an image after which a camera counts as stale."""
+    frozen_after: float = Field(1.0, ge=0, le=3600)
+    """Seconds of the very same picture after which a camera counts as frozen and is left out; 0 accepts any."""
+    trace: str = ""
+    """File for a trace of every stage that https://ui.perfetto.dev opens; at most 64 MB."""
 
     def check_complete(self) -> None:
         """Raise ConfigError where the parameters are each possible but together not enough to start with."""

@@ -2,6 +2,7 @@
 """The node's publishers. What nobody subscribes is not computed."""
 
 from collections.abc import Mapping
+from typing import Any
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -11,33 +12,39 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from cvcdepth_core.estimator import SurroundDepth
 from cvcdepth_core.pointcloud import CloudLimits
 from cvcdepth_core.rig import Rig
+from cvcdepth_ros.latencies import StageLatencies
 from cvcdepth_ros.messages import ros_message_class, ros_message_factory
-from cvcdepth_ros.surround_messages import SurroundMessages, output_types
+from cvcdepth_ros.surround_messages import SurroundMessages, camera_topics, output_types
+from cvcdepth_ros.synchronizer import SurroundSet
 
 
 class SurroundOutputs:
     """Publishes one set's depth, pictures and clouds under the node's private names."""
 
-    def __init__(self, node: Node, cameras: list[str], depth_encoding: str) -> None:
+    def __init__(self, node: Node, cameras: list[str], depth_encoding: str, latencies: StageLatencies) -> None:
         self._node = node
+        self._latencies = latencies
         self._messages = SurroundMessages(ros_message_factory(), depth_encoding)
         self._publishers = {topic: self._publisher(topic, type_) for topic, type_ in output_types(cameras).items()}
 
-    def wanted(self) -> bool:
-        """Whether anybody subscribes anything."""
-        return any(self._has_subscribers(topic) for topic in self._publishers)
+    def wanted(self, camera: str) -> bool:
+        """Whether anybody subscribes something for which this camera's depth is needed."""
+        return any(map(self._has_subscribers, camera_topics(camera)))
 
     def publish(
         self,
+        surround_set: SurroundSet[Any],
         depth: SurroundDepth,
         rig: Rig,
-        stamps: Mapping[str, int],
         frame_ids: Mapping[str, str],
         limits: CloudLimits,
     ) -> None:
         """Publish one set; see `SurroundMessages.of_set` for stamps and frames."""
-        for output in self._messages.of_set(depth, rig, stamps, frame_ids, limits, self._has_subscribers):
-            self._publishers[output.topic].publish(output.message)
+        with self._latencies.measure("postprocess"):
+            outputs = list(self._messages.of_set(surround_set, depth, rig, frame_ids, limits, self._has_subscribers))
+        with self._latencies.measure("publish"):
+            for output in outputs:
+                self._publishers[output.topic].publish(output.message)
 
     def close(self) -> None:
         """Drop all publishers."""

@@ -57,8 +57,13 @@ class Refusals:
 class SurroundReplay:
     """The surround sets of a recording, matched as the live node would match them."""
 
-    def __init__(self, recording: Recording, layout: RigLayout, matching: MatchingSettings) -> None:
-        """Complete the rig; RecordingError, RigError or TransformError names the first thing that is missing."""
+    def __init__(
+        self, recording: Recording, layout: RigLayout, matching: MatchingSettings, min_cameras: int = 0
+    ) -> None:
+        """Complete the rig; RecordingError, RigError or TransformError names the first thing that is missing.
+
+        `min_cameras` below the rig's number gives sets that lack the images of dead cameras; 0 gives only whole ones.
+        """
         self.recording = recording
         self.layout = layout
         self.unreadable = Refusals()
@@ -67,7 +72,7 @@ class SurroundReplay:
         self._rig: Rig | RigError = self._assembler.rig()
         self._tolerance = matching.tolerance
         self._synchroniser: SurroundSynchronizer[RecordedImage] = SurroundSynchronizer.of_rig(
-            layout, matching.tolerance, matching.queue_size
+            layout, matching.tolerance, matching.queue_size, min_cameras
         )
 
     @property
@@ -76,6 +81,11 @@ class SurroundReplay:
         if isinstance(self._rig, RigError):
             raise self._rig
         return self._rig
+
+    @property
+    def required(self) -> int:
+        """Images without which there is no set."""
+        return self._synchroniser.required
 
     @property
     def frame_ids(self) -> dict[str, str]:
@@ -163,10 +173,12 @@ class EstimatedSet:
 class DepthReplay:
     """Estimates every set of a replay. A set that cannot be estimated is left out and told in `refused`."""
 
-    def __init__(self, replay: SurroundReplay, estimator: DepthPredictor) -> None:
+    def __init__(
+        self, replay: SurroundReplay, estimator: DepthPredictor, latencies: StageLatencies | None = None
+    ) -> None:
         """Prepare for the replay's rig; RigError names a mask that does not fit."""
         self.refused = Refusals()
-        self.latencies = StageLatencies()
+        self.latencies = latencies or StageLatencies()
         self.estimator = estimator
         self._replay = replay
         self._surround = SurroundDepthEstimator(replay.rig, estimator)
@@ -178,8 +190,8 @@ class DepthReplay:
         for images in self._replay.sets(start, stop, handlers):
             try:
                 surround = self._current_surround()
-                messages = [image.message for image in images.images.values()]
-                depth = estimate_set(messages, surround, self.latencies)
+                messages = {name: image.message for name, image in images.images.items()}
+                depth = estimate_set(messages, surround, self.latencies, self._replay.required)
             except CvcDepthError as error:
                 self.refused.add(f"set at {images.stamp_ns} ns: {error}")
             else:
@@ -194,7 +206,7 @@ class DepthReplay:
 
     def _current_surround(self) -> SurroundDepthEstimator:
         if self._surround.rig is not self._replay.rig:
-            self._surround = SurroundDepthEstimator(self._replay.rig, self.estimator)
+            self._surround = SurroundDepthEstimator(self._replay.rig, self.estimator, self._surround)
         return self._surround
 
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Complete a rig file with what a recording or a live system says: CameraInfo and static transforms."""
 
+from collections.abc import Collection
 from typing import Any
 
 from cvcdepth_core.calibration import Calibration
@@ -62,6 +63,10 @@ class RigAssembler:
         waiting = f"camera {camera}: waiting for camera_info on {self._entry(camera).camera_info_topic}"
         return self._refused.get(camera, waiting)
 
+    def refusal(self, camera: str) -> str | None:
+        """Say why the camera's last CameraInfo cannot be used; None when it can, or the rig file's is used."""
+        return None if self._entry(camera).calibration else self._refused.get(camera)
+
     def transform_problem(self, camera: str) -> str | None:
         """Say why the camera's pose in the base frame is not known; None when it is."""
         entry = self._entry(camera)
@@ -74,12 +79,17 @@ class RigAssembler:
                 return f"camera {camera}: {error}"
         return None
 
-    def rig(self) -> Rig:
-        """Build the rig. RigError or TransformError names the first camera that lacks something."""
-        for problem in self.problems().values():
-            raise RigError(problem)
-        poses = {c.name: self._lookup(c) for c in self.layout.cameras if c.base_T_camera is None}
-        return self.layout.complete(self._calibrations, poses)
+    def rig(self, cameras: Collection[str] | None = None) -> Rig:
+        """Build the rig, of these cameras only where they are given.
+
+        RigError or TransformError names the first camera that lacks something.
+        """
+        layout = self.layout if cameras is None else self._layout_of(cameras)
+        for name, problem in self.problems().items():
+            if name in layout.names:
+                raise RigError(problem)
+        poses = {c.name: self._lookup(c) for c in layout.cameras if c.base_T_camera is None}
+        return layout.complete(self._calibrations, poses)
 
     def completed_layout(self) -> RigLayout:
         """Return the layout with everything that was collected filled in, its cameras ordered around the vehicle."""
@@ -97,6 +107,18 @@ class RigAssembler:
         }
         ordered = tuple(entries[name] for name in order_around_vehicle(poses))
         return self.layout.model_copy(update={"cameras": ordered})
+
+    def _layout_of(self, names: Collection[str]) -> RigLayout:
+        """Leave the other cameras out, also from the given neighbours; the first camera stands in for the anchor."""
+        entries = tuple(
+            entry.model_copy(update={"neighbours": tuple(n for n in entry.neighbours if n in names)})
+            if entry.neighbours
+            else entry
+            for entry in self.layout.cameras
+            if entry.name in names
+        )
+        anchor = self.layout.anchor if self.layout.anchor in names else None
+        return self.layout.model_copy(update={"cameras": entries, "anchor": anchor})
 
     def _entry(self, camera: str) -> CameraEntry:
         return next(entry for entry in self.layout.cameras if entry.name == camera)

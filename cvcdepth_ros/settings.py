@@ -7,7 +7,7 @@ The node declares these fields as parameters, the bag tool as options; each fiel
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from cvcdepth_core.calibration import first_validation_message
 from cvcdepth_core.errors import ConfigError
@@ -15,6 +15,9 @@ from cvcdepth_core.errors import ConfigError
 if TYPE_CHECKING:
     from cvcdepth_core.estimator import DepthEstimator
     from cvcdepth_core.pointcloud import CloudLimits
+
+
+_SMALLEST_VOXEL = 0.01
 
 
 class Settings(BaseModel):
@@ -64,6 +67,13 @@ class MatchingSettings(Settings):
     """Images that are kept per camera while their set is not complete."""
 
 
+class MissingCameraSettings(Settings):
+    """What becomes of sets when cameras fail."""
+
+    min_cameras: int = Field(0, ge=0, le=64)
+    """Cameras without which no set is made: with fewer than all, dead cameras are left out; 0 holds such sets back."""
+
+
 class OutputSettings(Settings):
     """What the depth images and clouds are like."""
 
@@ -75,10 +85,19 @@ class OutputSettings(Settings):
     """Merged cloud: metres from a camera below which points are left out."""
     cloud_max_range: float = Field(80.0, gt=0, le=1e4)
     """Merged cloud: metres from a camera above which points are left out."""
+    cloud_voxel: float = Field(0.0, ge=0, le=100)
+    """Merged cloud: edge in metres of the cubes that keep one point each, at least 0.01; 0 keeps all points."""
+
+    @field_validator("cloud_voxel")
+    @classmethod
+    def _check_voxel(cls, metres: float) -> float:
+        if 0 < metres < _SMALLEST_VOXEL:
+            raise ValueError(f"{metres} is neither 0 nor at least {_SMALLEST_VOXEL}")
+        return metres
 
     @property
     def cloud_limits(self) -> "CloudLimits":
         """The merged cloud's limits."""
         from cvcdepth_core.pointcloud import CloudLimits
 
-        return CloudLimits(self.cloud_stride, self.cloud_min_range, self.cloud_max_range)
+        return CloudLimits(self.cloud_stride, self.cloud_min_range, self.cloud_max_range, self.cloud_voxel)

@@ -20,6 +20,7 @@ from rclpy.utilities import remove_ros_args
 from cvcdepth_core.errors import CvcDepthError
 from cvcdepth_core.estimator import DepthEstimator
 from cvcdepth_core.rig import RigLayout, load_rig_layout
+from cvcdepth_ros.camera_states import CameraCondition, CameraState
 from cvcdepth_ros.diagnostics import ERROR, OK, WARN, status
 from cvcdepth_ros.live_rig import LiveRigDiscovery
 from cvcdepth_ros.node_parameters import (
@@ -34,6 +35,7 @@ from cvcdepth_ros.surround_session import SurroundSession
 
 _POLL_SECONDS = 0.25
 _DIAGNOSTICS_SECONDS = 1.0
+_FINE = CameraCondition(CameraState.OK)
 
 _HELP = """example:
   surround_depth_node --ros-args -p rig:=rig.yaml -p checkpoint:=model.safetensors
@@ -56,7 +58,7 @@ class SurroundDepthNode(LifecycleNode):  # type: ignore[misc] # rclpy is not ann
         self._discovery: LiveRigDiscovery | None = None
         self._session: SurroundSession | None = None
         self._failure = ""
-        self._reported: dict[str, str] = {}
+        self._reported: dict[str, CameraCondition] = {}
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         # Steady time: with use_sim_time and no /clock yet, these must run all the same.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -147,16 +149,22 @@ class SurroundDepthNode(LifecycleNode):  # type: ignore[misc] # rclpy is not ann
                 self._start_session(layout)
         if self._session is not None:
             self._session.poll()
-            self._report(self._session.problems())
+            self._report(self._session.conditions())
+            self._report_refusals(self._session.problem)
 
-    def _report(self, problems: dict[str, str]) -> None:
-        """Log each problem once, when it appears, and its end."""
-        for camera, problem in problems.items():
-            if self._reported.get(camera) != problem:
-                self.get_logger().warning(problem)
-        for camera in self._reported.keys() - problems.keys():
-            self.get_logger().info(f"camera {camera}: ok")
-        self._reported = problems
+    def _report(self, conditions: dict[str, CameraCondition]) -> None:
+        """Log what is wrong with each camera once, when it begins, and its end."""
+        for camera, condition in conditions.items():
+            if condition != self._reported.get(camera, _FINE):
+                if condition == _FINE:  # rclpy wants every line of code to log with one severity
+                    self.get_logger().info(f"camera {camera}: ok")
+                else:
+                    self.get_logger().warning(f"camera {camera}: {condition.text}")
+        self._reported = conditions
+
+    def _report_refusals(self, reason: str) -> None:
+        if reason:
+            self.get_logger().error(f"set refused: {reason}", throttle_duration_sec=5.0)
 
     def _publish_diagnostics(self) -> None:
         statuses = [self._node_status(), *(self._session.diagnostics() if self._session else [])]

@@ -119,7 +119,8 @@ class SurroundSynchronizer(Generic[T]):
                 f"min_cameras: expected a whole number from 0 to {len(cameras)}, the cameras there are, "
                 f"found {min_cameras!r}"
             )
-        self._required = min_cameras or len(cameras)
+        self.required = min_cameras or len(cameras)
+        """Images without which no set leaves."""
         self._tolerance = _to_nanoseconds("tolerance", tolerance, minimum=0.0)
         clock_jump_ns = _to_nanoseconds("clock_jump", clock_jump, minimum=tolerance)
         self._streams: dict[str, _Stream[T]] = {}
@@ -133,10 +134,12 @@ class SurroundSynchronizer(Generic[T]):
         self._lock = threading.Lock()
 
     @classmethod
-    def of_rig(cls, layout: "RigLayout", tolerance: float, queue_size: int = 10) -> "SurroundSynchronizer[T]":
+    def of_rig(
+        cls, layout: "RigLayout", tolerance: float, queue_size: int = 10, min_cameras: int = 0
+    ) -> "SurroundSynchronizer[T]":
         """Match the cameras of a rig with its anchor and its stamp offsets; the rest as in the constructor."""
         offsets = {camera.name: camera.stamp_offset for camera in layout.cameras}
-        return cls(layout.names, layout.anchor_camera, tolerance, offsets, queue_size)
+        return cls(layout.names, layout.anchor_camera, tolerance, offsets, queue_size, min_cameras=min_cameras)
 
     def add(self, camera: str, stamp_ns: int, image: T) -> list[SurroundSet[T]]:
         """Queue one image and return the sets that it completes, oldest first: mostly none or one.
@@ -185,7 +188,7 @@ class SurroundSynchronizer(Generic[T]):
                 if stamp is not None:
                     chosen[name] = stamp
             chosen = self._within_tolerance(anchor, chosen)
-            if len(chosen) >= self._required:
+            if len(chosen) >= self.required:
                 sets.append(self._emit(chosen))
             else:
                 self._pass_over(anchor)
@@ -202,15 +205,15 @@ class SurroundSynchronizer(Generic[T]):
 
     def _is_left_behind(self, camera: str) -> bool:
         """Whether enough others for a set have gone on without this camera."""
-        if self._required == len(self._streams):
+        if self.required == len(self._streams):
             return False
         stream = self._streams[camera]
-        return sum(_is_missing(stream, other) for other in self._streams.values()) >= self._required
+        return sum(_is_missing(stream, other) for other in self._streams.values()) >= self.required
 
     def _is_worth_waiting(self, stream: "_Stream[T]", anchor: int, stamp: int | None) -> bool:
         """Whether a nearer image of this camera, or one that says where the queued one belongs, may still come."""
         if stream.may_improve(anchor, stamp):
-            return self._required == len(self._streams) or not _is_missing(stream, self._streams[self._acting_anchor])
+            return self.required == len(self._streams) or not _is_missing(stream, self._streams[self._acting_anchor])
         return self._may_belong_to_next(anchor, stamp)
 
     def _may_belong_to_next(self, anchor: int, stamp: int | None) -> bool:

@@ -338,7 +338,7 @@ def test_the_result_says_what_was_done_with_what(whole: Path):
     assert (result["configuration"]["height"], result["configuration"]["tolerance"]) == (64, 0.1)
     assert [camera["name"] for camera in result["configuration"]["cameras"]] == list(CAMERAS)
     assert result["images"]["back"]["received"] == result["images"]["back"]["matched"] == 10
-    assert {"decode", "rectify", "inference", "write", "total"} <= result["seconds"].keys()
+    assert {"decode", "preprocess", "inference", "write", "total"} <= result["seconds"].keys()
 
 
 def test_an_existing_output_is_not_touched(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -25,12 +25,13 @@ from cvcdepth_ros.commands.arguments import (
     warn,
     window_ns,
 )
-from cvcdepth_ros.settings import MatchingSettings, ModelSettings, OutputSettings
+from cvcdepth_ros.settings import MatchingSettings, MissingCameraSettings, ModelSettings, OutputSettings
 from cvcdepth_ros.version import package_version
 
 if TYPE_CHECKING:
     from cvcdepth_core.rig import RigLayout
     from cvcdepth_ros.bags import Recording
+    from cvcdepth_ros.latencies import StageLatencies
     from cvcdepth_ros.replay import DepthReplay, EstimatedSet, SurroundReplay
 
 SUMMARY = """Compute depth and clouds into a new recording that Foxglove and RViz open.
@@ -47,7 +48,7 @@ EXAMPLES: tuple[str, ...] = (
 _RESULT_FILE = "run.json"
 
 
-class RunSettings(OutputSettings, MatchingSettings, ModelSettings):
+class RunSettings(OutputSettings, MissingCameraSettings, MatchingSettings, ModelSettings):
     """The settings of `run`."""
 
     clouds: Literal["merged", "all", "none"] = "merged"
@@ -64,6 +65,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_window(parser)
     add_settings(parser, RunSettings)
+    parser.add_argument(
+        "--trace", type=Path, metavar="FILE", help="write when each stage ran, for https://ui.perfetto.dev"
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     add_json(parser)
 
@@ -78,9 +82,10 @@ def execute(arguments: argparse.Namespace) -> None:
     with open_recording(arguments.recording) as recording:
         from cvcdepth_ros.replay import DepthReplay, SurroundReplay  # torch: not before there is a recording
 
-        replay = SurroundReplay(recording, _layout(arguments, recording), settings)
-        depths = DepthReplay(replay, settings.build_estimator())
-        outcome = _record(arguments, settings, replay, depths)
+        replay = SurroundReplay(recording, _layout(arguments, recording), settings, settings.min_cameras)
+        with _trace(arguments.trace) as latencies:
+            depths = DepthReplay(replay, settings.build_estimator(), latencies)
+            outcome = _record(arguments, settings, replay, depths)
         result = {
             "version": package_version(),
             "recording": str(recording.path),
@@ -94,6 +99,20 @@ def execute(arguments: argparse.Namespace) -> None:
     print_result(result, _text(result), arguments.json)
     if result["interrupted"]:
         raise KeyboardInterrupt
+
+
+@contextmanager
+def _trace(path: Path | None) -> "Iterator[StageLatencies]":
+    """Give stage latencies that write a trace, where a file for it is named."""
+    from cvcdepth_ros.latencies import StageLatencies
+    from cvcdepth_ros.trace_file import TraceFile
+
+    trace = TraceFile(path) if path else None
+    try:
+        yield StageLatencies(trace)
+    finally:
+        if trace is not None:
+            trace.close()
 
 
 def _layout(arguments: argparse.Namespace, recording: "Recording") -> "RigLayout":

@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How each camera fares: nothing yet, fine, or why nothing can be made of it, and since when. No ROS here.
+
+A camera's images are watched as they arrive; `CameraWatch.condition` is asked by a timer, so that silence is told too.
+"""
+
+import statistics
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+import numpy as np
+
+_INTERVALS = 9
+_SLOW_CAMERA_INTERVALS = 3
+_REPEATS_OF_A_FROZEN_CAMERA = 3
+_UNMATCHED_SECONDS, _UNMATCHED_INTERVALS = 3.0, 10
+_COMPARED_FIRST = 4096  # bytes
+
+
+class CameraState(Enum):
+    """What a camera is doing, the most specific trouble first."""
+
+    REJECTED = "rejected"
+    """Its images, its CameraInfo or its QoS cannot be used."""
+    FROZEN = "frozen"
+    """It sends the same stamp or the same picture again and again."""
+    STALE = "stale"
+    """It has sent images and does not any more."""
+    WAITING_FOR_CAMERA_INFO = "waiting for camera_info"
+    WAITING_FOR_TRANSFORM = "waiting for transform"
+    WAITING_FOR_IMAGES = "waiting for images"
+    UNMATCHED = "unmatched"
+    """Its images fit no set: their stamps are too far from the other cameras'."""
+    OK = "ok"
+
+
+@dataclass(frozen=True)
+class CameraCondition:
+    """A camera's state and everything that is known to stand in its way."""
+
+    state: CameraState
+    reasons: tuple[str, ...] = ()
+    """The one that gave the state first."""
+
+    @property
+    def text(self) -> str:
+        """One line: the state, then the reasons."""
+        reasons = "; ".join(self.reasons)
+        return reasons if reasons.startswith(self.state.value) else ": ".join(filter(None, (self.state.value, reasons)))
+
+
+Trouble = tuple[CameraState, str]
+"""A state and the reason for it."""
+
+
+class CameraWatch:
+    """Watches one camera's images as they come in. Thread-safe."""
+
+    def __init__(
+        self,
+        stale_after: float,  # s without an image
+        frozen_after: float,  # s with the same picture; 0: never
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Give a camera that is slower than `stale_after` three of its own intervals instead."""
+        self._stale_after = stale_after
+        self._frozen_after = frozen_after
+        self._clock = clock
+        self._intervals: deque[float] = deque(maxlen=_INTERVALS)
+        self._last: tuple[int, Any] | None = None
+        self._received: float | None = None
+        self._changed = 0.0
+        self._repeats = 0
+        self._refusal = ""
+        self._matched, self._matched_at = 0, 0.0
+        self._lock = threading.Lock()
+        self.refused = 0
+        """Images that could not be used."""
+        self.repeated = 0
+        """Images that were left out because the camera is frozen."""
+
+    def accept(self, stamp: int, content: Any) -> bool:
+        """Note an image (its stamp in ns, and its bytes); False when the camera is frozen and it must not be used."""
+        now = self._clock()
+        is_new = self._last is None or (stamp != self._last[0] and not _same_bytes(content, self._last[1]))
+        with self._lock:
+            if self._received is not None:
+                self._intervals.append(now - self._received)
+            else:
+                self._matched_at = now
+            self._received = now
+            self._last = (stamp, content)
+            self._repeats = 0 if is_new else self._repeats + 1
+            if is_new:
+                self._changed = now
+            frozen = self._is_frozen()
+            self.repeated += frozen
+            return not frozen
+
+    def used(self, refusal: str) -> None:
+        """Note what came of an image: why it could not be used, or nothing when it could."""
+        with self._lock:
+            self._refusal = refusal
+            self.refused += bool(refusal)
+
+    @property
+    def seconds_since_image(self) -> float | None:
+        """Seconds since the last image came; None before the first."""
+        with self._lock:
+            return None if self._received is None else self._clock() - self._received
+
+    @property
+    def newest_stamp(self) -> int | None:
+        """The last image's stamp in ns; None before the first."""
+        with self._lock:
+            return None if self._last is None else self._last[0]
+
+    @property
+    def interval(self) -> float:
+        """Median seconds between its last images; 0 while unknown."""
+        with self._lock:
+            return self._interval()
+
+    def troubles(self) -> list[Trouble]:
+        """Say what its images, or their absence, tell."""
+        with self._lock:
+            found: list[Trouble] = []
+            if self._refusal:
+                found.append((CameraState.REJECTED, self._refusal))
+            if self._received is None:
+                return [*found, (CameraState.WAITING_FOR_IMAGES, "no image yet")]
+            patience = self._patience(self._stale_after)
+            if self._clock() - self._received > patience:
+                found.append((CameraState.STALE, f"no image for more than {patience:.2g} s"))
+            elif self._is_frozen():
+                found.append((CameraState.FROZEN, "the same picture or stamp again and again"))
+            return found
+
+    def unmatched(self, matched: int) -> list[Trouble]:
+        """Say whether images come of which none fits a set any more, given how many have become part of one so far."""
+        with self._lock:
+            if self._received is None or matched != self._matched:
+                self._matched, self._matched_at = matched, self._clock()
+            patience = max(_UNMATCHED_SECONDS, _UNMATCHED_INTERVALS * self._interval())
+            if (self._received or 0.0) - self._matched_at > patience:
+                return [(CameraState.UNMATCHED, "its images come, but their stamps fit no set")]
+            return []
+
+    def _is_frozen(self) -> bool:
+        if not self._frozen_after or self._received is None or self._repeats < _REPEATS_OF_A_FROZEN_CAMERA:
+            return False
+        return self._received - self._changed >= self._frozen_after
+
+    def _patience(self, seconds: float) -> float:
+        return max(seconds, _SLOW_CAMERA_INTERVALS * self._interval())
+
+    def _interval(self) -> float:
+        return statistics.median(self._intervals) if self._intervals else 0.0
+
+
+def condition(camera: str, troubles: Sequence[Trouble]) -> CameraCondition:
+    """Join what is known of a camera, the most specific first."""
+    order = list(CameraState)
+    ranked = sorted(troubles, key=lambda trouble: order.index(trouble[0]))
+    if not ranked:
+        return CameraCondition(CameraState.OK)
+    reasons = dict.fromkeys(reason.removeprefix(f"camera {camera}: ") for _, reason in ranked)
+    return CameraCondition(ranked[0][0], tuple(reasons))
+
+
+def _same_bytes(one: Any, other: Any) -> bool:
+    """Compare two buffers; those of different pictures mostly differ early."""
+    if len(one) != len(other) or memoryview(one)[:_COMPARED_FIRST] != memoryview(other)[:_COMPARED_FIRST]:
+        return False
+    return np.array_equal(np.frombuffer(one, np.uint8), np.frombuffer(other, np.uint8))

@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From images to published depth, each step on a thread of its own so that none waits for another. No ROS here.
+
+    receive (caller) -> decode and rectify (pool) -> estimate (one thread, newest set wins) -> publish (one thread)
+
+Nothing piles up: of each camera one image waits to be decoded, one set to be estimated, one estimate to be published.
+What nobody wants is not computed.
+"""
+
+import queue
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from cvcdepth_core.errors import CvcDepthError, ImageError
+from cvcdepth_core.estimator import DepthPredictor, SurroundDepth, SurroundDepthEstimator
+from cvcdepth_core.images import Picture
+from cvcdepth_core.preprocess import Rectifier
+from cvcdepth_core.rig import Rig
+from cvcdepth_ros.camera_states import CameraWatch
+from cvcdepth_ros.latencies import StageLatencies
+from cvcdepth_ros.mailbox import Mailbox
+from cvcdepth_ros.messages import stamp_ns
+from cvcdepth_ros.picture_preparation import CameraImage, PicturePreparer
+from cvcdepth_ros.set_estimation import usable_pictures
+from cvcdepth_ros.synchronizer import SurroundSet, SurroundSynchronizer
+
+_JOIN_SECONDS = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class PublishedSet:
+    """What is handed to be published."""
+
+    images: SurroundSet[CameraImage]
+    rig: Rig
+    depth: SurroundDepth
+
+
+class SurroundPipeline:
+    """Runs from construction until `close`."""
+
+    def __init__(
+        self,
+        estimator: DepthPredictor,
+        synchroniser: SurroundSynchronizer[CameraImage],
+        mailbox: Mailbox[CameraImage],
+        watches: Mapping[str, CameraWatch],
+        wanted: Callable[[str], bool],
+        publish: Callable[[PublishedSet], None],
+        latencies: StageLatencies,
+    ) -> None:
+        """`watches` has every camera; `wanted` says whether a camera's depth is; `publish` runs on its own thread."""
+        self._estimator = estimator
+        self._synchroniser = synchroniser
+        self._mailbox = mailbox
+        self._watches = watches
+        self._wanted = wanted
+        self._publish = publish
+        self._latencies = latencies
+        self._surround: Future[SurroundDepthEstimator] | None = None
+        self._pace = _InferencePace()
+        self._preparer = PicturePreparer(len(watches))
+        self._estimates: queue.Queue[PublishedSet | None] = queue.Queue(maxsize=1)
+        self.problem = ""
+        """Why the last set could not be estimated or published; empty when it could."""
+        self.counters = Counter(
+            {"published": 0, "skipped: rig not complete": 0, "skipped: no subscriber": 0, "refused": 0}
+        )
+        self._threads = [
+            threading.Thread(target=self._estimate_sets, name="inference", daemon=True),
+            threading.Thread(target=self._publish_sets, name="publish", daemon=True),
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    @property
+    def rig_problem(self) -> str:
+        """Why the rig that was set cannot be used; empty when it can, or is not built yet."""
+        surround = self._surround
+        error = surround.exception() if surround is not None and surround.done() else None
+        return str(error) if error else ""
+
+    def set_rig(self, rig: Rig | None) -> None:
+        """Use these calibrations and cameras from now on; None: no set can be used until there is a rig again."""
+        former = self._surround
+        if rig is None:
+            self._surround = None
+        else:
+            self._surround = self._preparer.pool.submit(_surround_estimator, rig, self._estimator, former)
+
+    def add(self, camera: str, message: Any) -> None:
+        """Take an image message in; quick, for whoever receives them all."""
+        stamp = stamp_ns(message)
+        if not self._watches[camera].accept(stamp, message.data):
+            return
+        image = CameraImage(camera, message, self._latencies)
+        self._prepare_ahead(image)
+        for surround_set in self._synchroniser.add(camera, stamp, image):
+            self._mailbox.put(surround_set)
+
+    def close(self) -> bool:
+        """Stop; False when a thread is still inside its last set a second later."""
+        self._mailbox.close()
+        self._preparer.close()
+        for thread in self._threads:
+            thread.join(_JOIN_SECONDS)
+        return not any(thread.is_alive() for thread in self._threads)
+
+    def _prepare_ahead(self, image: CameraImage) -> None:
+        surround = self._surround
+        if surround is None or not surround.done() or surround.exception() or not self._wanted(image.camera):
+            return
+        rectifier = surround.result().preprocessor.rectifiers.get(image.camera)
+        # An image whose set will be replaced before the network is free need not be decoded.
+        if rectifier is not None and self._pace.is_free_within(self._watches[image.camera].interval):
+            self._preparer.prepare(image, rectifier)
+
+    def _estimate_sets(self) -> None:
+        while not self._mailbox.closed:
+            surround_set = self._mailbox.get()
+            if surround_set is not None:
+                self._guard(self._estimate, surround_set)
+        self._estimates.put(None)
+
+    def _publish_sets(self) -> None:
+        while (estimate := self._estimates.get()) is not None:
+            self._guard(self._hand_out, estimate)
+
+    def _guard(self, work: Callable[[Any], None], argument: Any) -> None:
+        """One bad set must not end the stream; its reason is kept."""
+        try:
+            work(argument)
+        except CvcDepthError as error:
+            self._refuse(str(error))
+        except Exception as error:
+            if not self._mailbox.closed:
+                self._refuse(f"{type(error).__name__}: {error}")
+
+    def _refuse(self, reason: str) -> None:
+        self.counters["refused"] += 1
+        self.problem = reason
+
+    def _estimate(self, surround_set: SurroundSet[CameraImage]) -> None:
+        surround = self._usable_surround()
+        if surround is None:
+            self.counters["skipped: rig not complete"] += 1
+            return
+        rectifiers = surround.preprocessor.rectifiers
+        images = {name: image for name, image in surround_set.images.items() if name in rectifiers}
+        wanted = {name: image for name, image in images.items() if self._wanted(name)}
+        if not wanted:
+            self.counters["skipped: no subscriber"] += 1
+            return
+        received = [image.received for image in surround_set.images.values()]
+        self._latencies.record("wait for set", max(received) - min(received))
+        self._latencies.record("wait for inference", time.monotonic() - max(received))
+        pictures = self._pictures(wanted, rectifiers, len(images))
+        with self._latencies.measure("inference"), self._pace.measured():
+            depth = surround.estimate([pictures.get(name) for name in rectifiers])
+        self._estimates.put(PublishedSet(surround_set, surround.rig, depth))
+
+    def _usable_surround(self) -> SurroundDepthEstimator | None:
+        surround = self._surround
+        return None if surround is None or surround.exception() else surround.result()
+
+    def _pictures(
+        self, wanted: Mapping[str, CameraImage], rectifiers: Mapping[str, Rectifier], cameras: int
+    ) -> dict[str, Picture]:
+        """Return the wanted pictures that can be made; ImageError when fewer of `cameras` are left than a set needs."""
+        with self._latencies.measure("wait for pictures"):
+            outcomes = self._preparer.pictures(wanted, rectifiers)
+        for name, outcome in outcomes.items():
+            self._watches[name].used(str(outcome) if isinstance(outcome, ImageError) else "")
+        return usable_pictures(outcomes, cameras, self._synchroniser.required)
+
+    def _hand_out(self, estimate: PublishedSet) -> None:
+        self._publish(estimate)
+        newest = max(image.received for image in estimate.images.images.values())
+        self._latencies.record("newest image to published", time.monotonic() - newest)
+        self.counters["published"] += 1
+        self.problem = ""
+
+
+class _InferencePace:
+    """Foresees when the network will be free, by the time that it took last."""
+
+    def __init__(self) -> None:
+        self._busy_until = 0.0
+        self._seconds = 0.0
+
+    @contextmanager
+    def measured(self) -> Iterator[None]:
+        """Take note of how long the block takes."""
+        start = time.monotonic()
+        self._busy_until = start + self._seconds
+        yield
+        self._busy_until = time.monotonic()
+        self._seconds = self._busy_until - start
+
+    def is_free_within(self, seconds: float) -> bool:
+        """Whether the running inference, if any, should be over in so many seconds."""
+        return self._busy_until - time.monotonic() <= seconds
+
+
+def _surround_estimator(
+    rig: Rig, estimator: DepthPredictor, former: Future[SurroundDepthEstimator] | None
+) -> SurroundDepthEstimator:
+    """Build the maps, taking over those of the cameras that have not changed."""
+    known = former.result() if former is not None and former.done() and not former.exception() else None
+    return SurroundDepthEstimator(rig, estimator, known)
