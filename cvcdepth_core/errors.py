@@ -22,8 +22,16 @@ class CheckpointError(CvcDepthError):
     """A checkpoint is missing, damaged, or does not fit the network."""
 
 
+class EngineError(CvcDepthError):
+    """An inference engine is not installed, gives another depth than the network, or is out of memory."""
+
+
 class TrainingError(CvcDepthError):
     """A training cannot go on."""
+
+
+class NotPromotedError(TrainingError):
+    """A training ended as it should, but its weights did not prove to be better than those it started from."""
 
 
 class OutputError(CvcDepthError):

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from cvcdepth_core.errors import CvcDepthError
+from cvcdepth_core.errors import CvcDepthError, NotPromotedError
 from cvcdepth_ros.commands import check, evaluate, finetune, inspect, play, rig, run
 from cvcdepth_ros.version import package_version
 
@@ -40,7 +40,10 @@ COMMANDS: Mapping[str, Command] = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command and return the exit code: 0, or 1 when the job failed. Wrong use ends by SystemExit(2)."""
+    """Run one command and return the exit code: 0, 1 when the job failed, 3 when a training was not promoted.
+
+    Wrong use ends by SystemExit(2).
+    """
     program = "cvcdepth" if Path(sys.argv[0]).name == "cvcdepth" else "bag_replay"
     try:
         parsed = build_parser(program).parse_args(arguments)
@@ -50,6 +53,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Whoever read our output (`| head`) is gone; without this the interpreter complains once more when it ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except NotPromotedError as error:
+        return _fail(program, str(error), code=3)
     except (CvcDepthError, OSError) as error:
         return _fail(program, str(error))
     except KeyboardInterrupt:
@@ -82,9 +87,9 @@ def _texts(program: str, description: str, examples: Sequence[str]) -> dict[str,
     }
 
 
-def _fail(program: str, reason: str) -> int:
+def _fail(program: str, reason: str, code: int = 1) -> int:
     print(f"{program}: {' '.join(reason.split())}", file=sys.stderr)
-    return 1
+    return code
 
 
 if __name__ == "__main__":

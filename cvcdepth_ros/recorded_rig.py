@@ -45,6 +45,19 @@ def recorded_cameras(recording: Recording) -> list[CameraEntry]:
     return discover_cameras({topic.name: topic.type for topic in recording.topics.values() if topic.count})
 
 
+def topics_without_images(recording: Recording) -> Iterator[str]:
+    """Give the camera_info topics beside which no image was recorded: a rig that is found would silently lack them."""
+    seeing = {camera.camera_info_topic for camera in recorded_cameras(recording)}
+    for topic in recording.topics.values():
+        if topic.type == CAMERA_INFO_TYPE and topic.name not in seeing and not is_of_depth(topic.name):
+            yield topic.name
+
+
+def is_of_depth(topic: str) -> bool:
+    """Say whether a topic's name tells that it is of depth images."""
+    return any(part.lower().startswith(("depth", "compresseddepth")) for part in topic.split("/"))
+
+
 def assemble_rig(recording: Recording, layout: RigLayout) -> RigAssembler:
     """Complete `layout` with each camera's first CameraInfo and the static transforms of the whole recording.
 

@@ -20,17 +20,15 @@ from numpy.typing import NDArray
 from cvcdepth_core.errors import ImageError, RecordingError, RigError, TransformError
 from cvcdepth_core.rig import RigLayout
 from cvcdepth_ros.bags import Location, RecordedMessage, Recording, file_identities, open_recording
-from cvcdepth_ros.camera_discovery import CAMERA_INFO_TYPE
 from cvcdepth_ros.lidar import VehicleMotion
 from cvcdepth_ros.messages import picture_from_message
-from cvcdepth_ros.recorded_rig import assemble_rig, discover_rig
+from cvcdepth_ros.recorded_rig import assemble_rig, discover_rig, topics_without_images
 from cvcdepth_ros.replay import RecordedImage, SurroundReplay
 from cvcdepth_ros.settings import MatchingSettings
 from cvcdepth_ros.synchronizer import SurroundSet
 
 _FORMAT = 1
 _THUMBNAIL = (40, 24)
-_INFO_SUFFIX = "/camera_info"
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,19 +117,10 @@ def _complete_layout(recording: Recording, layout: RigLayout | None) -> RigLayou
 
 
 def _refuse_blind_cameras(recording: Recording) -> None:
-    """Raise for a camera whose images were not recorded: a rig that is found would silently lack it."""
-    for topic in recording.topics.values():
-        if topic.type != CAMERA_INFO_TYPE or not topic.name.endswith(_INFO_SUFFIX):
-            continue
-        namespace = topic.name.removesuffix(_INFO_SUFFIX) + "/"
-        if not any(
-            other.count and other.name.startswith(namespace) and "Image" in other.type
-            for other in recording.topics.values()
-        ):
-            raise RecordingError(
-                f"{recording.path}: camera {namespace.strip('/')}: {topic.name} is recorded, but no image; a rig file "
-                "without this camera leaves it out"
-            )
+    for topic in topics_without_images(recording):
+        raise RecordingError(
+            f"{recording.path}: {topic} is recorded, but no image; a rig file without this camera leaves it out"
+        )
 
 
 def _collect(

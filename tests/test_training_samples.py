@@ -21,7 +21,7 @@ from cvcdepth_ros.messages import picture_from_message, stamp_ns
 from cvcdepth_ros.recorded_rig import discover_rig
 from cvcdepth_ros.settings import MatchingSettings
 from cvcdepth_ros.training_index import build_index, load_index
-from cvcdepth_ros.training_samples import RecordingBatches, SampleReader, find_samples, refuse_standstill
+from cvcdepth_ros.training_samples import RecordingBatches, SampleReader, _collate, find_samples, refuse_standstill
 
 MATCHING = MatchingSettings()
 EVERYTHING = RecordingsConfig(held_out=0.0)
@@ -127,7 +127,7 @@ def test_pictures_are_those_that_the_node_would_see(index):
 
 def test_a_camera_that_fires_later_stands_further_along_the_way(index):
     moved = reader(index).camera_poses(0, 5)
-    fixed = reader(index, EVERYTHING.model_copy(update={"exposure_motion": False})).camera_poses(0, 5)
+    fixed = reader(index, EVERYTHING.model_copy(update={"exposure_motion": "none"})).camera_poses(0, 5)
     delays = (index.stamps[5] - index.stamps[5, index.anchor]) / 1e9
     speed = np.linalg.norm(index.poses[6, 0, :3, 3] - index.poses[4, 0, :3, 3]) / 0.2
     ahead = (moved - fixed)[:, 0, 3]  # the base frame's x is forward
@@ -136,6 +136,34 @@ def test_a_camera_that_fires_later_stands_further_along_the_way(index):
     in_world = index.poses[5, index.anchor] @ moved
     np.testing.assert_allclose(in_world, index.poses[5] @ fixed, atol=1e-9)
     assert np.ptp(ahead) > 0.2
+
+
+def test_the_network_is_told_the_delays_that_no_recorded_motion_makes_good_for(index, tmp_path):
+    blind = build_index(write_rosbag2(tmp_path / "blind", without(sample_entries(), "/odom", "/tf")), MATCHING)
+    delays = (index.stamps[3] - index.stamps[3, index.anchor]) / 1e9
+
+    def third(recording, motion):
+        settings = EVERYTHING.model_copy(update={"exposure_motion": motion})
+        batches = RecordingBatches([recording], config(recordings=settings))
+        item = next(i for i, sample in enumerate(batches.reader.samples) if sample.target == 3)
+        return _collate(batches.reader.rigs, [batches.reader[item]])
+
+    told = {
+        (name, motion): third(recording, motion).exposure_delays
+        for name, recording, motion in (
+            ("moved", index, "auto"),
+            ("moved", index, "recorded"),
+            ("moved", index, "none"),
+            ("blind", blind, "none"),
+        )
+    }
+    assert set(told.values()) == {None}
+    for recording, motion in ((index, "network"), (blind, "auto"), (blind, "network")):
+        batch = third(recording, motion)
+        torch.testing.assert_close(batch.exposure_delays[0].double(), torch.from_numpy(delays), rtol=0, atol=1e-7)
+        torch.testing.assert_close(batch.context_times, torch.tensor([[-0.1, 0.1]]), rtol=0, atol=0.002)
+    with pytest.raises(RecordingError, match=r"blind: no motion is recorded, but recordings.exposure_motion is"):
+        third(blind, "recorded")
 
 
 def test_exposure_poses_lead_from_set_to_set_as_the_recorded_motion_does(index):
@@ -240,7 +268,7 @@ def test_an_index_is_kept_and_built_anew_when_the_recording_changes(tmp_path, in
 
 def test_a_camera_without_images_is_refused_by_name(tmp_path):
     entries = without(sample_entries(2), "/camera/left/image_raw/compressed")
-    with pytest.raises(RecordingError, match=r"lame: camera camera/left: .*but no image"):
+    with pytest.raises(RecordingError, match=r"lame: /camera/left/camera_info is recorded, but no image"):
         build_index(write_rosbag2(tmp_path / "lame", entries), MATCHING)
 
 

@@ -6,9 +6,15 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 from cvcdepth_ros.bags import Recording
-from cvcdepth_ros.camera_discovery import CAMERA_INFO_TYPE
 from cvcdepth_ros.checks.context import CheckContext, CheckResult
-from cvcdepth_ros.recorded_rig import IMAGE_TYPES, STATIC_TRANSFORMS, recorded_cameras, topic_problems
+from cvcdepth_ros.recorded_rig import (
+    IMAGE_TYPES,
+    STATIC_TRANSFORMS,
+    is_of_depth,
+    recorded_cameras,
+    topic_problems,
+    topics_without_images,
+)
 from cvcdepth_ros.transforms import frame_name
 
 _INFO = "camera_info"
@@ -25,7 +31,11 @@ def check_cameras(context: CheckContext) -> CheckResult:
         return _judged(problems, remedy, f"{len(layout.names)} of the rig file: {', '.join(layout.names)}")
     names = [camera.name for camera in recorded_cameras(recording)]
     found = f"{len(names)} found: {', '.join(names)}" if names else "none found"
-    values = {"cameras": names, "without_images": [*_blind(recording)], "without_camera_info": [*_unknown(recording)]}
+    values = {
+        "cameras": names,
+        "without_images": [*topics_without_images(recording)],
+        "without_camera_info": [*_unknown(recording)],
+    }
     if values["without_images"]:
         remedy = "record its images, or give a rig file without this camera (--rig)"
         return CheckResult("failed", f"{found}; no image beside {', '.join(values['without_images'])}", remedy, values)
@@ -108,22 +118,10 @@ def _without_cameras() -> CheckResult:
     return CheckResult("skipped", "needs at least two cameras and transforms without contradictions")
 
 
-def _blind(recording: Recording) -> Iterator[str]:
-    """Give the camera_info topics beside which no image was recorded."""
-    seeing = {camera.camera_info_topic for camera in recorded_cameras(recording)}
-    for topic in recording.topics.values():
-        if topic.type == CAMERA_INFO_TYPE and topic.name not in seeing and not _is_of_depth(topic.name):
-            yield topic.name
-
-
 def _unknown(recording: Recording) -> Iterator[str]:
     """Give the image topics beside which no camera_info was recorded."""
     known = tuple(camera.camera_info_topic.removesuffix(_INFO) for camera in recorded_cameras(recording))
     for topic in recording.topics.values():
-        is_picture = topic.type in IMAGE_TYPES and not _is_of_depth(topic.name)
+        is_picture = topic.type in IMAGE_TYPES and not is_of_depth(topic.name)
         if is_picture and topic.count and not topic.name.startswith(known):
             yield topic.name
-
-
-def _is_of_depth(topic: str) -> bool:
-    return any(part.lower().startswith(("depth", "compresseddepth")) for part in topic.split("/"))

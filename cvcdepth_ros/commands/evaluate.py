@@ -11,7 +11,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cvcdepth_core.errors import RecordingError
 from cvcdepth_ros.commands.arguments import (
     add_json,
     add_quiet,
@@ -159,26 +158,21 @@ def _is_drawable() -> bool:
 def _result(
     arguments: argparse.Namespace, settings: EvaluationSettings, jobs: Sequence[EvaluationJob], folder: Path
 ) -> "EvaluationResult":
-    from cvcdepth_ros.evaluation.result import EvaluationResult, Failure, Model
+    from cvcdepth_ros.evaluation.result import EvaluationResult, Failure
     from cvcdepth_ros.evaluation.workers import KeptParts, evaluate_all
 
     depends_on = settings.dependencies()
     kept = KeptParts(folder / _PARTS, depends_on)
-    scores, failed = [], []
+    outcomes = []
     with _pool(arguments, settings) as pool, _progress(len(jobs), arguments.quiet) as progress:
         for job, outcome in evaluate_all(jobs, arguments.workers or 1, kept, progress, pool):
-            if isinstance(outcome, Failure):
-                failed.append(outcome)
-            else:
-                scores.append(outcome)
+            outcomes.append(outcome)
+            if not isinstance(outcome, Failure):
                 _warn_of_damage(job, outcome)
-    for failure in failed if scores else failed[1:]:
+    failed = [outcome for outcome in outcomes if isinstance(outcome, Failure)]
+    for failure in failed if len(failed) < len(outcomes) else failed[1:]:
         warn(f"not evaluated: {failure.reason}")
-    if not scores:
-        raise RecordingError(f"nothing could be evaluated: {failed[0].reason}")
-    model = Model(scores[0].summary["model"], settings.checkpoint or None, depends_on.sha256)
-    ordered = sorted(scores, key=lambda found: found.name)
-    return EvaluationResult(depends_on.version, model, jobs[0].configuration(), ordered, sorted(failed))
+    return EvaluationResult.of(jobs, outcomes, depends_on)
 
 
 def _pool(arguments: argparse.Namespace, settings: EvaluationSettings) -> "AbstractContextManager[Pool | None]":

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,10 +13,11 @@ from typing import Any, NamedTuple
 
 from cvcdepth_core.comparison import Comparison, compare
 from cvcdepth_core.consistency import AgreementRow, summarise_agreement
-from cvcdepth_core.errors import ConfigError
+from cvcdepth_core.errors import ConfigError, RecordingError
 from cvcdepth_core.scores import SCALINGS, Scaling, Scores, Summary, sorted_rows
 from cvcdepth_core.scores import Protocol as ScoreProtocol
 from cvcdepth_ros.evaluation.frames import ImageScore, SetScore, correlations, image_scores, set_scores
+from cvcdepth_ros.evaluation.job import Dependencies, EvaluationJob
 from cvcdepth_ros.evaluation.recording import RecordingScores
 
 SCHEMA = 1
@@ -52,6 +53,23 @@ class EvaluationResult:
     recordings: Sequence[RecordingScores]
     """Sorted by name, so that nothing depends on the order in which they were finished."""
     failed: Sequence[Failure]
+
+    @classmethod
+    def of(
+        cls, jobs: Sequence[EvaluationJob], outcomes: Iterable[RecordingScores | Failure], depends_on: Dependencies
+    ) -> EvaluationResult:
+        """Join what became of the jobs, in any order, all of the same settings.
+
+        Raises RecordingError, with the first reason, when none could be evaluated.
+        """
+        found = list(outcomes)
+        failed = [outcome for outcome in found if isinstance(outcome, Failure)]
+        scores = [outcome for outcome in found if not isinstance(outcome, Failure)]
+        if not scores:
+            raise RecordingError(f"nothing could be evaluated: {failed[0].reason}")
+        model = Model(scores[0].summary["model"], jobs[0].settings.checkpoint or None, depends_on.sha256)
+        ordered = sorted(scores, key=lambda found: found.name)
+        return cls(depends_on.version, model, jobs[0].configuration(), ordered, sorted(failed))
 
     @cached_property
     def scores(self) -> Scores:
