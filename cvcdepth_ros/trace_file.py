@@ -8,6 +8,7 @@ opened whatever ended the program. Its size is bounded; what comes later is left
 import json
 import os
 import threading
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -40,15 +41,18 @@ class TraceFile:
                 self._write({"name": "thread_name", "ph": "M", "args": {"name": threading.current_thread().name}})
             self._write(event | ({"args": arguments} if arguments else {}))
 
+    def flush(self) -> None:
+        """Bring onto the disk what is there so far."""
+        with self._lock, suppress(OSError):
+            self._file.flush()
+
     def close(self) -> None:
         """Complete the file."""
         with self._lock:
             self._left = 0
-            try:
+            with suppress(OSError, ValueError):  # what was written can be opened all the same
                 self._file.write('{"name": "end", "ph": "M"}]\n')
                 self._file.close()
-            except OSError:  # what was written can be opened all the same
-                pass
 
     def _write(self, event: dict[str, Any]) -> None:
         line = json.dumps(event | {"pid": os.getpid(), "tid": threading.get_native_id()}) + ",\n"

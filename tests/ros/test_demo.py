@@ -282,7 +282,8 @@ def diagnostics(published: int, matched: int = 10, replaced: int = 0) -> Any:
     """The node's DiagnosticArray, in the words of its diagnostics module."""
     from diagnostic_msgs.msg import DiagnosticArray
 
-    from cvcdepth_ros.diagnostics import OK, camera_status, latency_status, status, synchronisation_status
+    from cvcdepth_ros.camera_states import CameraCondition, CameraState, CameraWatch
+    from cvcdepth_ros.diagnostics import OK, camera_status, inference_status, status, synchronisation_status
     from cvcdepth_ros.latencies import StageLatencies
     from cvcdepth_ros.mailbox import MailboxStatistics
     from cvcdepth_ros.synchronizer import CameraStatistics, SynchronizerStatistics
@@ -298,9 +299,12 @@ def diagnostics(published: int, matched: int = 10, replaced: int = 0) -> Any:
     counters = {"published": published, "skipped: no subscriber": 0, "refused": 0}
     statuses = [
         status(OK, "node", "active"),
-        *(camera_status(name, None, values, lost=3) for name, values in cameras.items()),
+        *(
+            camera_status(name, CameraCondition(CameraState.OK), values, CameraWatch(1.0, 1.0), lost=3)
+            for name, values in cameras.items()
+        ),
         synchronisation_status(SynchronizerStatistics(matched, cameras), mailbox, counters),
-        latency_status(latencies.summaries(), OK, "a model"),
+        inference_status(latencies.summaries(), mailbox, "", "a model"),
     ]
     for entry in statuses:
         entry.name = f"surround_depth: {entry.name}"

@@ -237,7 +237,7 @@ def set_size(info: CameraInfo) -> None:
     [
         (set_k_to_zero, "camera left", "K[0] = 0: the camera is not calibrated"),
         (set_model, "camera left", "kannala_brandt_17"),
-        (set_size, "inference", "camera left: image of 960x540, but its camera_info says 1920x1080"),
+        (set_size, "camera left", "rejected: image of 960x540, but its camera_info says 1920x1080"),
     ],
 )
 def test_an_impossible_camera_info_is_named_and_awaited(spoil, subject, text, graph, messages, rig_content, tmp_path):
@@ -275,7 +275,7 @@ def test_an_unknown_encoding_is_named(graph, messages, rig_content, tmp_path):
         for message in messages["/camera/left/image_raw/compressed"]:
             image = Image(header=message.header, height=540, width=960, encoding="yuv422", step=1920)
             publisher.publish(image)
-        return "camera left: encoding 'yuv422' is not supported" in message_of(graph, "inference")
+        return "encoding 'yuv422' is not supported" in message_of(graph, "camera left")
 
     feed.publish_until(refused, "the refusal")
 
@@ -452,7 +452,7 @@ def test_full_size_raw_images_at_ten_hertz_are_not_lost(graph, messages, rig_con
     graph.spin_until(
         lambda: all(graph.values(f"camera {name}").get("received") == str(sets) for name in CAMERAS), "every image", 20
     )
-    age = "age at publish (ROS time) p50 (ms)"
+    age = "age of newest image at publish (ROS time) p50 (ms)"
     graph.spin_until(lambda: age in graph.values("inference"), "a published set")
     assert {graph.values(f"camera {name}")["lost in transport"] for name in CAMERAS} == {"0"}
     assert graph.values("synchronisation")["matched"] == str(sets)
