@@ -1,0 +1,25 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every inference engine offers."""
+
+from typing import Literal, Protocol
+
+import torch
+from torch import Tensor
+
+Precision = Literal["float32", "bfloat16", "float16"]
+"""In what an engine computes; depth is float32 always."""
+
+
+class DisparityEngine(Protocol):
+    """A depth network made ready to run on one device."""
+
+    @property
+    def name(self) -> str:
+        """Say what computes, with its version and precision, for results and diagnostics."""
+
+    @property
+    def device(self) -> torch.device:
+        """Where it takes its images."""
+
+    def disparity(self, images: Tensor) -> Tensor:
+        """Return the disparity [B, 1, H, W] in (0, 1) of `images` [B, 3, H, W] in [0, 1], float32 on `device`."""
