@@ -7,12 +7,13 @@ Pixel centres are the integers, u to the right and v down; poses are named `targ
 from __future__ import annotations
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 PROJECTION_EPSILON = 1e-7
 """Added to z before the division (method section 5)."""
 
 _LEAST_DENOMINATOR = 1e-12  # keeps coordinates and their gradients finite in the focal plane, in float32 too
+_SMALL_SQUARED_ANGLE = 1e-2  # rad^2: below, series are more exact than quotients of small numbers
 
 
 def axis_angle_to_rotation(axis_angle: Tensor) -> Tensor:
@@ -44,6 +45,42 @@ def rigid_inverse(target_T_source: Tensor) -> Tensor:
     """Return `source_T_target` [..., 4, 4]."""
     rotation = target_T_source[..., :3, :3].mT
     return rigid(rotation, -(rotation @ target_T_source[..., :3, 3:]).squeeze(-1))
+
+
+def rigid_power(target_T_source: Tensor, exponent: Tensor) -> Tensor:
+    """Return the poses [..., 4, 4] that the motions [..., 4, 4] reach after `exponent` [...] of their way.
+
+    Velocity and turn rate stay constant on the way: exp(a log T). Differentiable at standstill; rotations have to be
+    smaller than half a turn.
+    """
+    power: Tensor = torch.linalg.matrix_exp(exponent[..., None, None] * _rigid_log(target_T_source))
+    return power
+
+
+def _rigid_log(pose: Tensor) -> Tensor:
+    """Return the twists [..., 4, 4] whose matrix exponential is `pose`."""
+    skew, squared_angle = _rotation_log(pose[..., :3, :3])
+    angle = torch.where(squared_angle < _SMALL_SQUARED_ANGLE, 1.0, squared_angle).sqrt()
+    beyond_linear = torch.where(
+        squared_angle < _SMALL_SQUARED_ANGLE,
+        1 / 12 + squared_angle / 720 + squared_angle.square() / 30240,
+        (1 - angle / 2 / (angle / 2).tan()) / angle.square(),
+    )
+    identity = torch.eye(3, dtype=pose.dtype, device=pose.device)
+    velocity = (identity - skew / 2 + beyond_linear[..., None, None] * (skew @ skew)) @ pose[..., :3, 3:]
+    return nn.functional.pad(torch.cat([skew, velocity], dim=-1), (0, 0, 0, 1))
+
+
+def _rotation_log(rotation: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the axis-angle as a skew matrix [..., 3, 3], and the angle's square [...]."""
+    skew = (rotation - rotation.mT) / 2  # of length sin(angle)
+    squared_sine = skew.square().sum((-2, -1)) / 2
+    cosine = (rotation.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
+    is_small = (squared_sine < _SMALL_SQUARED_ANGLE) & (cosine > 0)
+    sine = torch.where(is_small, 1.0, squared_sine).sqrt()
+    series = 1 + squared_sine / 6 + 3 / 40 * squared_sine.square() + 5 / 112 * squared_sine**3
+    ratio = torch.where(is_small, series, torch.atan2(sine, cosine) / sine)
+    return ratio[..., None, None] * skew, ratio.square() * squared_sine
 
 
 def pixel_rays(inverse_intrinsics: Tensor, height: int, width: int) -> Tensor:

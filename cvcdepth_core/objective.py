@@ -111,6 +111,7 @@ def evaluate_objective(
     precision of its inputs, outside autocast: projections need more than half precision.
     """
     with torch.autocast(batch.frames.device.type, enabled=False):
+        batch = batch.at_exposures(prediction.motions[:, :, batch.anchor])
         if config.corrected:
             batch = _with_binary_masks(batch)
         views = synthesise_views(batch, prediction, config)
@@ -139,6 +140,7 @@ def _with_binary_masks(batch: RigBatch) -> RigBatch:
 
 def synthesise_views(batch: RigBatch, prediction: Prediction, config: ObjectiveConfig) -> Views:
     """Render every view that the terms of `config` compare: all samples, frames and cameras in two warps."""
+    batch = batch.at_exposures(prediction.motions[:, :, batch.anchor])
     points = back_project(prediction.depth, batch.inverse_intrinsics)
     temporal = warp_views(
         points=points[:, None],

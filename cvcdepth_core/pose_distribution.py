@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
-from cvcdepth_core.geometry import axis_angle_to_rotation, rigid, rigid_inverse
+from cvcdepth_core.geometry import axis_angle_to_rotation, rigid, rigid_inverse, rigid_power
 
 
 def motion_to_context(axis_angle: Tensor, translation: Tensor, backward: bool) -> Tensor:
@@ -29,6 +30,22 @@ def distribute_anchor_motion(anchor_motion: Tensor, base_T_camera: Tensor, ancho
 def distribute_vehicle_motion(vehicle_motion: Tensor, base_T_camera: Tensor) -> Tensor:
     """Give every camera the motion of the base frame: inv(E_i) T E_i; shapes as in `distribute_anchor_motion`."""
     return _conjugate(vehicle_motion[:, :, None], base_T_camera)
+
+
+def poses_at_exposure(
+    base_T_camera: Tensor, anchor_motion: Tensor, anchor: int, delays: Tensor, context_times: Tensor
+) -> Tensor:
+    """Return each camera's pose [B, N, 4, 4] at its own exposure, in the base frame at the anchor's.
+
+    Between two frames the vehicle keeps its velocity and turn rate, those of the predicted `anchor_motion`
+    [B, F, 4, 4] (context_T_target), each of which spans `context_times` [B, F] seconds; a camera that fires after the
+    anchor, by `delays` [B, N] seconds, goes by a context after the target, and one before by one before.
+    """
+    context = (delays[:, :, None] * context_times[:, None] >= 0).float().argmax(dim=-1)  # [B, N]
+    share = delays / context_times.gather(1, context)
+    context_T_target = anchor_motion[torch.arange(len(delays), device=delays.device)[:, None], context]
+    target_T_exposure = rigid_power(rigid_inverse(context_T_target), share)
+    return base_T_camera[:, anchor, None] @ target_T_exposure @ _anchor_frame(base_T_camera, anchor)
 
 
 def motions_seen_from_anchor(camera_motions: Tensor, base_T_camera: Tensor, anchor: int) -> Tensor:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from cvcdepth_core.errors import ImageError, RigError, TransformError
+from cvcdepth_core.pose_distribution import poses_at_exposure
 from cvcdepth_core.poses import check_rigid
 
 
@@ -37,12 +38,17 @@ class RigBatch:
     """N names, for messages."""
     anchor: int = 0
     """Index of the front camera, whose motion the pose network predicts."""
+    exposure_delays: Tensor | None = None
+    """[B, N] seconds from the anchor's exposure to each camera's; None where `base_T_camera` is of the exposures."""
+    context_times: Tensor | None = None
+    """[B, F] seconds from the target to each context frame, negative for one before; needed with `exposure_delays`."""
 
     def __post_init__(self) -> None:
         _check_shapes(self)
         _check_images(self)
         _check_calibration(self)
         _check_neighbours(self)
+        _check_exposures(self)
 
     @property
     def images(self) -> Tensor:
@@ -65,6 +71,26 @@ class RigBatch:
         inverse: Tensor = torch.linalg.inv_ex(self.intrinsics).inverse
         return inverse
 
+    def at_exposures(self, anchor_motion: Tensor) -> RigBatch:
+        """Return the batch with every camera where it was when it fired, by the anchor camera's motion.
+
+        `anchor_motion` [B, F, 4, 4] is `context_T_target`. The poses keep its gradient. Were it stopped, depth would
+        follow a baseline of rig and predicted way, and the way's scale follow depth; where the way is opposite to the
+        rig's baseline and more than half of it, that chase leads away from the true scale instead of to it.
+        """
+        if self.exposure_delays is None or self.context_times is None:
+            return self
+        moved = copy.copy(self)
+        moved.base_T_camera = poses_at_exposure(
+            self.base_T_camera,
+            anchor_motion,
+            self.anchor,
+            self.exposure_delays,
+            self.context_times,
+        )
+        moved.exposure_delays = None
+        return moved
+
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> RigBatch:
         """Return the batch on `device` and with floating-point tensors of `dtype`, without checking it again."""
         moved = copy.copy(self)
@@ -77,8 +103,10 @@ class RigBatch:
     def first_sample(self) -> RigBatch:
         """Return the batch's first sample as a batch of its own, without checking it again."""
         one = copy.copy(self)
-        for name in ("frames", "masks", "intrinsics", "base_T_camera"):
-            setattr(one, name, getattr(self, name)[:1])
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, Tensor) and field.name not in ("targets", "sources"):
+                setattr(one, field.name, value[:1])
         return one
 
 
@@ -144,3 +172,18 @@ def _check_neighbours(batch: RigBatch) -> None:
     lonely = [names[camera] for camera in range(cameras) if camera not in {target for target, _ in pairs}]
     if lonely:
         raise RigError(f"camera {', '.join(lonely)}: no neighbour, so no overlap to learn its scale from")
+
+
+def _check_exposures(batch: RigBatch) -> None:
+    if batch.exposure_delays is None:
+        return
+    samples, frames, cameras = batch.frames.shape[:3]
+    times = torch.zeros(0) if batch.context_times is None else batch.context_times
+    for name, value, shape in (
+        ("exposure_delays", batch.exposure_delays, [samples, cameras]),
+        ("context_times", times, [samples, frames - 1]),
+    ):
+        if list(value.shape) != shape or not bool(torch.isfinite(value).all()):
+            raise RigError(f"{name}: found {list(value.shape)} {value.tolist()}, expected finite seconds {shape}")
+    if not bool(times.all()):
+        raise RigError(f"context_times {times.tolist()}: a context frame is of the target's moment")

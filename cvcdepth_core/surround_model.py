@@ -89,13 +89,15 @@ class SurroundModel(nn.Module):
         return frames
 
     def _motions(self, batch: RigBatch, vectors: list[MotionVector], flips: Tensor) -> Tensor:
-        """Return the motions [B, 2, N, 4, 4] of all cameras to the frames -1 and +1."""
+        """Return the motions [B, 2, N, 4, 4] of all cameras, from exposure to exposure, to the frames -1 and +1."""
         before, after = vectors
         raw = [motion_to_context(*before, backward=True), motion_to_context(*after, backward=False)]
         motions = torch.stack([motion.view(len(flips), -1, 4, 4) for motion in raw], dim=1)
         motions = mirror_motion(motions, flips, _VEHICLE_LATERAL_AXIS if self.pose_method == "joint" else 0)
         if self.pose_method == "per_camera":
             return motions
+        motion = motions.squeeze(2)
         if self.pose_method == "joint":
-            return distribute_vehicle_motion(motions.squeeze(2), batch.base_T_camera)
-        return distribute_anchor_motion(motions.squeeze(2), batch.base_T_camera, batch.anchor)
+            anchors = distribute_vehicle_motion(motion, batch.base_T_camera)[:, :, batch.anchor]
+            return distribute_vehicle_motion(motion, batch.at_exposures(anchors).base_T_camera)
+        return distribute_anchor_motion(motion, batch.at_exposures(motion).base_T_camera, batch.anchor)

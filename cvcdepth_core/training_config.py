@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from cvcdepth_core.augmentation import ColorJitterConfig, FlipMode
 from cvcdepth_core.checkpoint import DepthModelSpec
@@ -16,6 +16,8 @@ from cvcdepth_core.errors import ConfigError
 from cvcdepth_core.networks import EncoderName
 from cvcdepth_core.objective import ObjectiveConfig
 from cvcdepth_core.surround_model import PoseMethod
+
+ExposureMotion = Literal["auto", "recorded", "network", "none"]
 
 _BASE_KEY = "base"
 
@@ -54,15 +56,22 @@ class RecordingsConfig(_Section):
     pictures, of 255."""
     max_interval: float = Field(default=0.5, gt=0, allow_inf_nan=False)
     """Seconds from a target to a context frame, at most: a longer gap of the recording is not bridged."""
-    exposure_motion: bool = True
-    """Place each camera where it was when it fired, by the recorded motion. The published method takes the exposures of
-    one set as simultaneous."""
+    exposure_motion: ExposureMotion = "auto"
+    """How the vehicle moved between the exposures of one set, which tells where each camera was when it fired:
+    `recorded` (odometry or /tf), `network` (as the pose network says, at constant velocity between two sets), `auto`
+    (recorded where there is some, else of the network), or `none`, as in the published method, which takes the
+    exposures as simultaneous. `true` is `auto`, `false` is `none`."""
     tolerance: float = Field(default=0.1, gt=0, le=10)
     """Seconds that two images of one set may be apart."""
     workers: int = Field(default=0, ge=0)
     """Processes that read and decode; 0 does it in the training process."""
     cache_mb: int = Field(default=512, ge=0)
     """Rectified pictures that each process keeps in memory, MB; 0 decodes every picture anew."""
+
+    @field_validator("exposure_motion", mode="before")
+    @classmethod
+    def _exposure_motion_may_be_switched(cls, value: Any) -> Any:
+        return {True: "auto", False: "none"}[value] if isinstance(value, bool) else value
 
 
 class OptimizerConfig(_Section):

@@ -138,8 +138,11 @@ class NetworkRig:
             tuple(rig.neighbour_indices),
         )
 
-    def batch(self, frames: Tensor, base_T_camera: Tensor) -> RigBatch:
-        """Join pictures (uint8 [B, 3, N, H, W, 3], target first) and poses [B, N, 4, 4] with the rig's constants."""
+    def batch(self, frames: Tensor, base_T_camera: Tensor, delays: Tensor, context_times: Tensor) -> RigBatch:
+        """Join what samples have of their own with the rig's constants.
+
+        That is pictures (uint8 [B, 3, N, H, W, 3], target first), poses [B, N, 4, 4] and the times of `ReadSample`.
+        """
         samples = len(frames)
         masks = torch.from_numpy(self.preprocessor.valid).float()[:, None]
         intrinsics = torch.from_numpy(self.preprocessor.intrinsics).float()
@@ -152,6 +155,8 @@ class NetworkRig:
             sources=torch.tensor([source for _, source in self.pairs]),
             camera_names=self.names,
             anchor=self.anchor,
+            exposure_delays=delays.float() if bool(delays.any()) else None,
+            context_times=context_times.float(),
         )
 
 
@@ -185,6 +190,10 @@ class ReadSample(NamedTuple):
     """[3, N, H, W, 3] of target, before and after."""
     base_T_camera: NDArray[np.float64]
     """[N, 4, 4] at the target."""
+    exposure_delays: NDArray[np.float64]
+    """[N] seconds from the anchor's exposure to each camera's that the poses do not tell yet."""
+    context_times: NDArray[np.float64]
+    """[2] seconds from the target to before and after."""
 
 
 class SampleReader(Dataset[ReadSample | None]):
@@ -217,7 +226,8 @@ class SampleReader(Dataset[ReadSample | None]):
             frames = [self.pictures(sample.recording, row) for row in (sample.target, sample.before, sample.after)]
         except ImageError:
             return None
-        return ReadSample(sample.recording, np.stack(frames), self.camera_poses(sample.recording, sample.target))
+        poses = self.camera_poses(sample.recording, sample.target)
+        return ReadSample(sample.recording, np.stack(frames), poses, *self.exposures(sample))
 
     def pictures(self, recording: int, row: int) -> NDArray[np.uint8]:
         """Return the rectified pictures [N, H, W, 3] of a set; ImageError names the camera of a damaged one."""
@@ -234,11 +244,19 @@ class SampleReader(Dataset[ReadSample | None]):
         is the same from any camera's exposure to its next.
         """
         index, base_T_camera = self._indexes[recording], self.rigs[recording].base_T_camera
-        if not self._exposure_motion or index.poses is None:
+        if self._exposure_motion not in ("auto", "recorded") or index.poses is None:
             return base_T_camera
         anchor_T_world = inverse(index.poses[row, index.anchor])
         moved: NDArray[np.float64] = anchor_T_world @ index.poses[row] @ base_T_camera
         return moved
+
+    def exposures(self, sample: Sample) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the delays [N] that the pose network's motion has to make good for, and the contexts' times [2], s."""
+        index = self._indexes[sample.recording]
+        stamps = (index.stamps - index.stamps[sample.target, index.anchor]) / NANOSECONDS
+        by_network = self._exposure_motion == "network" or (self._exposure_motion == "auto" and index.poses is None)
+        delays = stamps[sample.target] if by_network else np.zeros(len(stamps[0]))
+        return delays, stamps[[sample.before, sample.after], index.anchor]
 
     def _rectified(self, recording: int, row: int) -> Iterator[Picture]:
         messages = self._messages(recording, row)
@@ -292,6 +310,7 @@ class RecordingBatches:
 
     def __init__(self, indexes: Sequence[RecordingIndex], config: TrainingConfig, processes: Processes = ALONE) -> None:
         """Find the samples; RecordingError names recording and values when there are none."""
+        _refuse_unrecorded_motion(indexes, config.recordings)
         refuse_standstill(indexes, config.recordings)
         samples = [
             sample
@@ -327,6 +346,15 @@ class RecordingBatches:
         orders = [generator.permutation(group).tolist() for group in self._rig_groups]
         batches = [order[start : start + size] for order in orders for start in range(0, len(order), size)]
         return [batches[i] for i in generator.permutation(len(batches))]
+
+
+def _refuse_unrecorded_motion(indexes: Sequence[RecordingIndex], config: RecordingsConfig) -> None:
+    without = [str(index.path) for index in indexes if index.poses is None]
+    if config.exposure_motion == "recorded" and without:
+        raise RecordingError(
+            f"{', '.join(without)}: no motion is recorded, but recordings.exposure_motion is 'recorded'; 'auto' takes "
+            "the pose network's there"
+        )
 
 
 def _at_least(samples: list[int], count: int) -> list[int]:
@@ -366,6 +394,6 @@ def _collate(rigs: Sequence[NetworkRig], items: Sequence[ReadSample | None]) -> 
     read = [item for item in items if item is not None]
     if not read:
         return None
-    frames = torch.from_numpy(np.stack([item.pictures for item in read]))
-    base_T_camera = torch.from_numpy(np.stack([item.base_T_camera for item in read]))
-    return rigs[read[0].recording].batch(frames, base_T_camera)
+    recordings, *columns = zip(*read, strict=True)
+    rig: NetworkRig = rigs[recordings[0]]
+    return rig.batch(*(torch.from_numpy(np.stack(column)) for column in columns))

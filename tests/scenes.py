@@ -2,7 +2,7 @@
 """Rigs and scenes for the tests: random ones for algebra, and a textured slanted plane with known depth for physics."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -84,17 +84,48 @@ def slanted_plane(
 
     The base frame is that of a camera between them: z forward, x right. The rig travels sideways and ahead.
     """
-    inward = torch.tensor([[0.0, turn, 0.0], [0.0, -turn, 0.0]], dtype=FLOAT64)
-    sideways = torch.tensor([[-baseline / 2, 0.0, 0.0], [baseline / 2, 0.0, 0.0]], dtype=FLOAT64)
-    base_T_camera = rigid(axis_angle_to_rotation(inward), sideways).unsqueeze(0)
-    focal = 0.9 * width
-    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=FLOAT64)
-    intrinsics = K.expand(1, 2, 3, 3).clone()
+    base_T_camera = _side_by_side(baseline, turn)
     step = torch.tensor([[-travel, 0.02, -travel / 2], [travel, 0.02, travel / 2]], dtype=FLOAT64)
     world_T_base = rigid(
         torch.eye(3, dtype=FLOAT64).expand(3, 3, 3), torch.cat([torch.zeros(1, 3, dtype=FLOAT64), step])
     )
-    world_T_camera = world_T_base[:, None] @ base_T_camera
+    return _seen_plane(world_T_base[:, None] @ base_T_camera, base_T_camera, height, width, tilt)
+
+
+def passed_plane(delays: tuple[float, float], velocity: float, yaw_rate: float = 0.0) -> PlaneScene:
+    """Render the two cameras of `slanted_plane`, which fire after one another, from a rig in constant motion.
+
+    Its velocity is sideways, metres per frame; it turns about the vertical, radians per frame. The cameras fire
+    `delays` after the frame's moment, in frames, which are seconds here.
+    """
+    base_T_camera = _side_by_side(baseline=0.8, turn=0.06)
+    twist = torch.zeros(4, 4, dtype=FLOAT64)
+    twist[0, 2], twist[2, 0], twist[0, 3] = yaw_rate, -yaw_rate, velocity
+    times = torch.tensor([0.0, -1.0, 1.0], dtype=FLOAT64)[:, None] + torch.tensor(delays, dtype=FLOAT64)
+    world_T_base = torch.linalg.matrix_exp(times[..., None, None] * twist)
+    scene = _seen_plane(world_T_base @ base_T_camera, base_T_camera, height=48, width=64, tilt=(0.25, 0.15))
+    batch = replace(
+        scene.batch,
+        exposure_delays=torch.tensor([delays], dtype=FLOAT64),
+        context_times=torch.tensor([[-1.0, 1.0]], dtype=FLOAT64),
+    )
+    return replace(scene, batch=batch)
+
+
+def _side_by_side(baseline: float, turn: float) -> Tensor:
+    """Return base_T_camera [1, 2, 4, 4]."""
+    inward = torch.tensor([[0.0, turn, 0.0], [0.0, -turn, 0.0]], dtype=FLOAT64)
+    sideways = torch.tensor([[-baseline / 2, 0.0, 0.0], [baseline / 2, 0.0, 0.0]], dtype=FLOAT64)
+    return rigid(axis_angle_to_rotation(inward), sideways).unsqueeze(0)
+
+
+def _seen_plane(
+    world_T_camera: Tensor, base_T_camera: Tensor, height: int, width: int, tilt: tuple[float, float]
+) -> PlaneScene:
+    """Render the plane from the poses [3, 2, 4, 4] at the frames 0, -1 and +1."""
+    focal = 0.9 * width
+    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=FLOAT64)
+    intrinsics = K.expand(1, 2, 3, 3).clone()
     images, depths = zip(
         *(render_plane(pose, intrinsics[0], height, width, tilt) for pose in world_T_camera), strict=True
     )

@@ -16,6 +16,7 @@ from cvcdepth_core.geometry import (
     project,
     rigid,
     rigid_inverse,
+    rigid_power,
     rotation_to_euler_xyz,
     transform,
 )
@@ -24,6 +25,7 @@ from cvcdepth_core.pose_distribution import (
     distribute_vehicle_motion,
     motion_to_context,
     motions_seen_from_anchor,
+    poses_at_exposure,
     relative_poses,
 )
 from cvcdepth_core.view_synthesis import align_intensity, sample, splat_depth, warp_views
@@ -38,6 +40,42 @@ def random_poses(seed: int, *shape: int) -> Tensor:
     generator = torch.Generator().manual_seed(seed)
     vectors = torch.randn(2, *shape, 3, dtype=FLOAT64, generator=generator)
     return rigid(axis_angle_to_rotation(vectors[0]), vectors[1])
+
+
+@given(seed=SEEDS, first=st.floats(-1, 1), second=st.floats(-1, 1), size=st.sampled_from([0.0, 1e-4, 0.09, 0.5]))
+def test_powers_of_a_motion_are_parts_of_its_way(seed, first, second, size):
+    vectors = size * torch.randn(2, 5, 3, dtype=FLOAT64, generator=torch.Generator().manual_seed(seed))
+    motion = rigid(axis_angle_to_rotation(vectors[0]), vectors[1])
+    one, other, both = (
+        rigid_power(motion, torch.full((5,), a, dtype=FLOAT64)) for a in (first, second, first + second)
+    )
+    torch.testing.assert_close(one @ other, both, rtol=0, atol=1e-8)
+    torch.testing.assert_close(rigid_power(motion, torch.ones(5, dtype=FLOAT64)), motion, rtol=0, atol=1e-8)
+
+
+def test_a_part_of_the_way_is_differentiable_at_standstill_and_elsewhere():
+    def half(vector: Tensor) -> Tensor:
+        return rigid_power(rigid(axis_angle_to_rotation(vector[:3]), vector[3:]), torch.tensor(0.5, dtype=FLOAT64))
+
+    for size in (0.0, 0.05, 0.5):
+        assert torch.autograd.gradcheck(half, (size * torch.ones(6, dtype=FLOAT64)).requires_grad_())
+
+
+@given(seed=SEEDS)
+def test_poses_at_exposure_are_those_of_a_vehicle_with_constant_velocity_and_turn_rate(seed):
+    generator = torch.Generator().manual_seed(seed)
+    spin, velocity = 0.3 * torch.randn(2, 3, dtype=FLOAT64, generator=generator)
+    twist = torch.zeros(4, 4, dtype=FLOAT64)
+    twist[:3, :3], twist[:3, 3] = torch.linalg.cross(spin.expand(3, 3), torch.eye(3, dtype=FLOAT64)).T, velocity
+    base_T_camera = random_poses(seed, 1, 4)
+    delays = torch.rand(1, 4, dtype=FLOAT64, generator=generator) - 0.5
+    delays[0, 2] = 0
+    times = torch.tensor([[-0.8, 1.1]], dtype=FLOAT64)
+    target_T_context = torch.linalg.matrix_exp(times[..., None, None] * twist)
+    anchor_motion = rigid_inverse(target_T_context @ base_T_camera[:, None, 2]) @ base_T_camera[:, None, 2]
+    found = poses_at_exposure(base_T_camera, anchor_motion, 2, delays, times)
+    expected = torch.linalg.matrix_exp(delays[..., None, None] * twist) @ base_T_camera
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-8)
 
 
 @settings(max_examples=30, deadline=None)

@@ -111,3 +111,12 @@ def test_a_mistake_is_named_in_one_line_with_the_file_the_field_and_the_choices(
         load_training_config(path)
     assert str(tmp_path) in str(error.value)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(("written", "meant"), [("true", "auto"), ("false", "none"), ("network", "network")])
+def test_exposure_motion_may_be_a_switch(tmp_path, written, meant):
+    path = tmp_path / "config.yaml"
+    path.write_text(DEPTH + f"recordings: {{exposure_motion: {written}}}\n")
+    config = load_training_config(path)
+    assert config.recordings.exposure_motion == meant
+    assert TrainingConfig.model_validate_json(config.model_dump_json()) == config
