@@ -298,12 +298,18 @@ def _chunk_records(chunk: Chunk) -> list[McapRecord]:
     return breakup_chunk(replace(chunk, compression="", data=content), validate_crc=True)
 
 
+def unpack_zstd(packed: bytes | memoryview, most: int) -> bytes:
+    """Decompress into no more than `most` bytes, whatever is declared; raises ZstdError."""
+    # The library believes a frame's own size before the limit that it is given.
+    if zstandard.frame_content_size(packed) > most:
+        raise zstandard.ZstdError(f"unpacks to more than {most} bytes")
+    return zstandard.decompress(packed, most)
+
+
 def _unpacked(chunk: Chunk) -> bytes:
     """Decompress a chunk into no more memory than it announces, whatever is packed in it."""
     if chunk.compression == "zstd":
-        if zstandard.frame_content_size(chunk.data) > chunk.uncompressed_size:
-            raise McapError(f"unpacks to more than the {chunk.uncompressed_size} bytes that it announces")
-        return zstandard.decompress(chunk.data, chunk.uncompressed_size)
+        return unpack_zstd(chunk.data, chunk.uncompressed_size)
     if chunk.compression == "lz4":
         unpacked: bytes = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, chunk.uncompressed_size)
         return unpacked

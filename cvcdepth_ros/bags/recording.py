@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recording, whatever it is stored in: `open_recording` guesses the format from the files' first bytes."""
 
-import shutil
 from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import cached_property, partial
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import IO, Any
 
 import yaml
 import zstandard
@@ -15,7 +14,7 @@ from rosbags.typesys.store import Typestore
 
 from cvcdepth_core.errors import RecordingError
 from cvcdepth_ros.bags import mcap_file, ros1_file, sqlite_file
-from cvcdepth_ros.bags.mcap_file import McapFile
+from cvcdepth_ros.bags.mcap_file import MAX_BLOCK_BYTES, McapFile, unpack_zstd
 from cvcdepth_ros.bags.ordering import Source, in_time_order
 from cvcdepth_ros.bags.remote import Location, RemotePath, location
 from cvcdepth_ros.bags.ros1_file import Ros1File
@@ -29,6 +28,9 @@ _LOCAL_READERS: dict[bytes, Callable[[Path], RecordingFile]] = {
 }
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _FOREVER = 2**63 - 1
+# Raw images of a dark garage shrink to a hundredth; what shrinks to less is no recording.
+_MAX_EXPANSION = 500
+_PIECE_BYTES = 2**20
 _SHOWN_DAMAGES = 5
 
 RecordingPath = str | Location
@@ -151,7 +153,7 @@ class Recording:
 
     def _unpacked_cdr(self, message: RecordedMessage) -> bytes | None:
         try:
-            return zstandard.decompress(message.cdr)
+            return unpack_zstd(message.cdr, MAX_BLOCK_BYTES)
         except zstandard.ZstdError as error:
             damage = f"{self.path}: {message.topic} at {message.log_time} ns skipped ({error})"
             if damage not in self._damage:
@@ -231,10 +233,17 @@ class Recording:
         target = Path(self._unpacked.name) / path.stem
         try:
             with zstandard.open(path, "rb") as packed, target.open("wb") as unpacked:
-                shutil.copyfileobj(packed, unpacked)
+                _copy(packed, unpacked, _MAX_EXPANSION * path.stat().st_size)
         except zstandard.ZstdError as error:
             raise RecordingError(f"{path}: cannot be decompressed: {error}") from error
         return target
+
+
+def _copy(packed: IO[bytes], unpacked: IO[bytes], most: int) -> None:
+    while piece := packed.read(_PIECE_BYTES):
+        if unpacked.tell() + len(piece) > most:
+            raise zstandard.ZstdError(f"unpacks to more than {most} bytes, {_MAX_EXPANSION} times its size")
+        unpacked.write(piece)
 
 
 def _begins(beginning: bytes) -> str:

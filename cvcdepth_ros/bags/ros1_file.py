@@ -8,11 +8,11 @@ from pathlib import Path
 from rosbags.interfaces import Connection, ConnectionExtRosbag1
 from rosbags.rosbag1 import Reader, ReaderError
 from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, TypesysError, get_typestore
 
 from cvcdepth_core.errors import RecordingError
 from cvcdepth_ros.bags.topics import LATCHED, RecordedMessage, RecordingFile, Topic, error_text, joined_topics
-from cvcdepth_ros.bags.typestores import typestore, typestore_for
+from cvcdepth_ros.bags.typestores import parsed_definition, typestore, typestore_for
 
 MAGIC = b"#ROSBAG V2.0\n"
 # What rosbags and the decompressors raise on damaged bytes (its reader also asserts; bz2: EOFError, lz4: RuntimeError).
@@ -58,7 +58,9 @@ class Ros1File(RecordingFile):
 
 
 def _topic(connection: Connection) -> Topic:
-    types = get_types_from_msg(connection.msgdef.data, connection.msgtype)
+    types = parsed_definition(connection.msgdef.data, connection.msgtype)
+    if connection.msgtype not in types:
+        raise TypesysError(f"that of {connection.msgtype}, which is not complete or no definition")
     types.update({name: typestore().fielddefs[name] for name in _ROS2_TYPES})
     store = get_typestore(Stores.EMPTY)
     store.register(types)

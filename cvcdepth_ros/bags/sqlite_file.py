@@ -11,6 +11,7 @@ from cvcdepth_core.errors import RecordingError
 from cvcdepth_ros.bags.topics import RecordedMessage, RecordingFile, Topic, joined_topics, recorded_qos
 
 MAGIC = b"SQLite format 3\0"
+_TABLES = ("topics", "messages", "message_definitions")
 
 
 class SqliteFile(RecordingFile):
@@ -23,6 +24,7 @@ class SqliteFile(RecordingFile):
         self.size = path.stat().st_size
         try:
             with closing(self._connect()) as database:
+                _check_tables(database)
                 self._names = self._readable_names(database)
                 self.topics = joined_topics([*self._read_topics(database)], path)
                 self.start, self.end = database.execute(
@@ -30,6 +32,8 @@ class SqliteFile(RecordingFile):
                 ).fetchone()
         except sqlite3.Error as error:
             raise RecordingError(f"{path}: not readable as a rosbag2 database: {error}") from error
+        if not isinstance(self.start, int | None) or not isinstance(self.end, int | None):
+            raise RecordingError(f"{path}: timestamps from {self.start!r:.40} to {self.end!r:.40} are not integers")
 
     def messages(self, topics: Collection[str], start: int, stop: int) -> Iterator[RecordedMessage]:
         """Give the messages of `topics` with start <= log_time < stop, in time order."""
@@ -42,8 +46,11 @@ class SqliteFile(RecordingFile):
         with closing(self._connect()) as database:
             try:
                 for id_, log_time, cdr in database.execute(query, (start, stop, *wanted)):
-                    yield RecordedMessage(wanted[id_], log_time, cdr)
-                    count += 1
+                    if isinstance(log_time, int) and isinstance(cdr, bytes):
+                        yield RecordedMessage(wanted[id_], log_time, cdr)
+                        count += 1
+                    else:
+                        self._report(f"{wanted[id_]}: a row with no integer as time or no bytes as message was skipped")
             except sqlite3.DatabaseError as error:
                 self._report(f"reading stopped after {count} messages", error)
 
@@ -59,12 +66,15 @@ class SqliteFile(RecordingFile):
         database = sqlite3.connect(f"file:{quote(str(self.path.resolve()))}?mode=ro&{option}", uri=True)
         if leftover:
             database.execute("PRAGMA locking_mode=EXCLUSIVE")
+        database.execute("PRAGMA trusted_schema=OFF")
         return database
 
     def _readable_names(self, database: sqlite3.Connection) -> dict[int, str]:
         names = {}
         for id_, name, encoding in database.execute("SELECT id, name, serialization_format FROM topics ORDER BY id"):
-            if encoding == "cdr":
+            if not isinstance(name, str):
+                self._report(f"left out topic {id_}: its name is {name!r:.40}")
+            elif encoding == "cdr":
                 names[id_] = name
             else:
                 self._report(f"left out {name}: serialization format {encoding!r} is not cdr")
@@ -75,8 +85,19 @@ class SqliteFile(RecordingFile):
         definitions = _definitions(database)
         qos = "offered_qos_profiles" if "offered_qos_profiles" in _columns(database, "topics") else "NULL"
         for id_, type_, profiles in database.execute(f"SELECT id, type, {qos} FROM topics ORDER BY id"):
-            if id_ in self._names:
-                yield Topic(self._names[id_], type_, counts.get(id_, 0), recorded_qos(profiles), definitions.get(type_))
+            if id_ in self._names and isinstance(type_, str):
+                qos_text = profiles if isinstance(profiles, str) else None
+                yield Topic(self._names[id_], type_, counts.get(id_, 0), recorded_qos(qos_text), definitions.get(type_))
+
+
+def _check_tables(database: sqlite3.Connection) -> None:
+    """Refuse what only looks like a table: a view, a virtual table or computed columns may go on for ever when read."""
+    rows = database.execute("SELECT name, type FROM sqlite_master WHERE type IN ('table', 'view')").fetchall()
+    kinds = {name: kind for name, kind in rows if name in _TABLES}
+    for name, kind in kinds.items():
+        computed = [row[1] for row in database.execute(f"PRAGMA table_xinfo({name})") if row[6]]
+        if kind != "table" or computed:
+            raise sqlite3.DatabaseError(f"{name} is no plain table")
 
 
 def _definitions(database: sqlite3.Connection) -> dict[str, str]:
@@ -84,7 +105,7 @@ def _definitions(database: sqlite3.Connection) -> dict[str, str]:
     if not _columns(database, "message_definitions"):
         return {}
     rows = database.execute("SELECT topic_type, encoded_message_definition FROM message_definitions")
-    return {type_: definition for type_, definition in rows if definition}
+    return {type_: definition for type_, definition in rows if definition and isinstance(definition, str)}
 
 
 def _columns(database: sqlite3.Connection, table: str) -> set[str]:

@@ -1,16 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which message types are known, and how their bytes are laid out."""
 
+import re
 from collections.abc import Iterable
 from functools import cache
 
-from rosbags.interfaces.typing import Typesdict
-from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.interfaces import Nodetype
+from rosbags.interfaces.typing import FieldDesc, Typesdict
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from cvcdepth_ros.bags.topics import Topic
 
 _SEPARATOR = "=" * 80 + "\n"
+_TYPE_NAME = re.compile(r"[A-Za-z]\w*(/[A-Za-z]\w*)+", re.ASCII)
+_FIELD_NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)
+# The longest definitions of real messages have some hundred fields and 50 kB, most of it comments.
+_MAX_DEFINITION = 2**18
+_MAX_FIELDS = 2000
 
 
 @cache
@@ -28,23 +35,32 @@ def typestore_for(topics: Iterable[Topic]) -> Typestore:
     """
     carried: Typesdict = {}
     for topic in topics:
-        carried.update(_types_of(topic))
+        carried.update(parsed_definition(topic.definition, topic.type))
     shared = typestore().fielddefs
     own = {name: fields for name, fields in carried.items() if not _same_layout(shared, name, carried)}
-    if not own:
+    # Definitions that are complete alone may lead back to each other when one replaces what another relied on.
+    if not own or not _are_complete({**shared, **own}):
         return typestore()
     store = get_typestore(Stores.EMPTY)
     store.register({**shared, **own})
     return store
 
 
-def _types_of(topic: Topic) -> Typesdict:
-    try:
-        if topic.definition and topic.definition.startswith(_SEPARATOR + "IDL: "):
-            return _types_of_idl(topic.definition)
-        return get_types_from_msg(topic.definition, topic.type) if topic.definition else {}
-    except TypesysError:
+def parsed_definition(definition: str | None, type_name: str) -> Typesdict:
+    """Return the types of a definition (.msg or IDL text) that a recording carries; nothing where it cannot be used.
+
+    A library makes Python code out of them. Hence constants are left out, and a definition is passed over whole when a
+    name in it is no identifier, when it is not complete without itself, or when its code would be without measure.
+    """
+    if not definition or len(definition) > _MAX_DEFINITION:
         return {}
+    try:
+        is_idl = definition.startswith(_SEPARATOR + "IDL: ")
+        types = _types_of_idl(definition) if is_idl else get_types_from_msg(definition, type_name)
+    except Exception:  # a grammar that meets foreign text may raise anything, RecursionError included
+        return {}
+    plain: Typesdict = {name: ([], fields) for name, (_, fields) in types.items()}
+    return plain if _are_usable(plain) else {}
 
 
 def _types_of_idl(definition: str) -> Typesdict:
@@ -53,6 +69,40 @@ def _types_of_idl(definition: str) -> Typesdict:
     for part in definition.split(_SEPARATOR)[1:]:
         types.update(get_types_from_idl(part.partition("\n")[2]))
     return types
+
+
+def _are_usable(types: Typesdict) -> bool:
+    fields = [field for _, fields in types.values() for field in fields]
+    names = all(map(_TYPE_NAME.fullmatch, types)) and all(_FIELD_NAME.fullmatch(name) for name, _ in fields)
+    unrolled = sum(_unrolled(kind) for _, kind in fields)
+    return names and len(fields) <= _MAX_FIELDS and unrolled <= _MAX_FIELDS and _are_complete(types)
+
+
+def _unrolled(kind: FieldDesc) -> int:
+    """Count the elements of a fixed array that get code of their own: all but numbers."""
+    if kind[0] != Nodetype.ARRAY:
+        return 0
+    element, count = kind[1]
+    is_number = element[0] == Nodetype.BASE and element[1][0] not in ("string", "wstring")
+    return 0 if is_number else count
+
+
+def _are_complete(types: Typesdict) -> bool:
+    """Say whether every type consists of known ones and, in the end, of no part of itself."""
+    known = typestore().fielddefs
+    waiting = {
+        name: {part for _, kind in fields if (part := _part(kind)) is not None and part not in known.keys() - types}
+        for name, (_, fields) in types.items()
+    }
+    while ready := {name for name, parts in waiting.items() if not parts}:
+        waiting = {name: parts - ready for name, parts in waiting.items() if name not in ready}
+    return not waiting
+
+
+def _part(kind: FieldDesc) -> str | None:
+    """Return the type that a field, or each of its elements, is of; None for numbers and text."""
+    element = kind[1][0] if kind[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE) else kind
+    return str(element[1]) if element[0] == Nodetype.NAME else None
 
 
 def _same_layout(shared: Typesdict, name: str, carried: Typesdict) -> bool:
