@@ -7,6 +7,7 @@ from setuptools import find_packages, setup
 
 NAME = "cvcdepth_ros"
 SHARE = Path("share") / NAME
+TEMPLATES = ["evaluation/report/templates/*", "finetuning/templates/*"]
 # `colcon build --symlink-install` runs a link to this file elsewhere.
 REQUIREMENTS = Path(__file__).resolve().parent / "requirements"
 
@@ -33,7 +34,7 @@ setup(
     maintainer_email="maintainers@cvcdepth.invalid",
     python_requires=">=3.10",
     packages=find_packages(include=["cvcdepth_core*", "cvcdepth_ros*"]),
-    package_data={"cvcdepth_core": ["py.typed"], "cvcdepth_ros": ["py.typed", "evaluation/report/templates/*.html"]},
+    package_data={"cvcdepth_core": ["py.typed"], "cvcdepth_ros": ["py.typed", *TEMPLATES]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (str(SHARE), ["package.xml"]),
@@ -43,7 +44,7 @@ setup(
     install_requires=["torch>=2.3", *requirements("core")],
     extras_require={
         "ros-jazzy": requirements("ros"),
-        **{name: requirements(name) for name in ("s3", "report", "fleet")},
+        **{name: requirements(name) for name in ("s3", "report", "fleet", "tensorboard")},
     },
     zip_safe=True,
     entry_points={

@@ -14,8 +14,8 @@ from cvcdepth_core.scores import ALL, OVERLAP, Score
 from cvcdepth_ros.evaluation.frames import SetScore
 from cvcdepth_ros.evaluation.result import EvaluationResult
 
-_GROUND, _PANEL, _TEXT, _LINES = "#121418", "#1c1f25", "#ebeef2", "#3e444e"
-_PREDICTED, _SCALED, _SPATIAL, _TEMPORAL = "#4fb3ff", "#ffc440", "#ff7a8a", "#79e08f"
+_GROUND, _PANEL, TEXT, LINES = "#121418", "#1c1f25", "#ebeef2", "#3e444e"
+BLUE, YELLOW, RED, GREEN = "#4fb3ff", "#ffc440", "#ff7a8a", "#79e08f"
 _DPI = 130
 _NAMED_RECORDINGS = 12
 
@@ -37,55 +37,55 @@ def error_by_camera(result: EvaluationResult) -> bytes:
 
 def time_series(sets: Sequence[SetScore]) -> bytes:
     """Abs Rel and the label-free scores, set after set, recording after recording."""
-    figure, (errors, disagreement) = _figure(13, 5.2, rows=2)
+    figure, (errors, disagreement) = dark_figure(13, 5.2, rows=2)
     numbers = np.arange(len(sets))
     starts = [i for i in range(len(sets)) if i == 0 or sets[i].recording != sets[i - 1].recording]
-    _line(errors, numbers, starts, [s.abs_rel for s in sets], _PREDICTED, "Abs Rel")
-    _line(disagreement, numbers, starts, [s.label_free.spatial for s in sets], _SPATIAL, "between cameras")
-    _line(disagreement, numbers, starts, [s.label_free.temporal for s in sets], _TEMPORAL, "along the way")
+    _line(errors, numbers, starts, [s.abs_rel for s in sets], BLUE, "Abs Rel")
+    _line(disagreement, numbers, starts, [s.label_free.spatial for s in sets], RED, "between cameras")
+    _line(disagreement, numbers, starts, [s.label_free.temporal for s in sets], GREEN, "along the way")
     for axes, title in ((errors, "Abs Rel"), (disagreement, "median relative disagreement, label-free")):
-        axes.set_title(title, loc="left", color=_TEXT, fontsize=11)
+        axes.set_title(title, loc="left", color=TEXT, fontsize=11)
         axes.set_xlim(-0.5, max(len(sets) - 0.5, 0.5))
         axes.set_ylim(0, 1.2 * axes.dataLim.ymax if axes.has_data() else 1)
         for start in starts[1:]:
-            axes.axvline(start - 0.5, color=_LINES)
+            axes.axvline(start - 0.5, color=LINES)
     _name_recordings(errors, sets, starts)
-    _legend(disagreement)
-    disagreement.set_xlabel("set", color=_TEXT)
-    return _png(figure)
+    add_legend(disagreement)
+    disagreement.set_xlabel("set", color=TEXT)
+    return to_png(figure)
 
 
 def label_free_against_error(sets: Sequence[SetScore]) -> bytes:
     """Each set's label-free scores against its Abs Rel."""
-    figure, (axes,) = _figure(6.4, 3.4)
-    for name, colour, label in (("spatial", _SPATIAL, "between cameras"), ("temporal", _TEMPORAL, "along the way")):
+    figure, (axes,) = dark_figure(6.4, 3.4)
+    for name, colour, label in (("spatial", RED, "between cameras"), ("temporal", GREEN, "along the way")):
         known = [s for s in sets if not np.isnan(s.abs_rel + getattr(s.label_free, name))]
         x, y = [getattr(s.label_free, name) for s in known], [s.abs_rel for s in known]
         axes.scatter(x, y, s=14, color=colour, label=label)
-    axes.set_title("Abs Rel over disagreement, a dot per set", loc="left", color=_TEXT, fontsize=11)
-    axes.set_xlabel("median relative disagreement", color=_TEXT)
-    axes.set_ylabel("Abs Rel", color=_TEXT)
+    axes.set_title("Abs Rel over disagreement, a dot per set", loc="left", color=TEXT, fontsize=11)
+    axes.set_xlabel("median relative disagreement", color=TEXT)
+    axes.set_ylabel("Abs Rel", color=TEXT)
     axes.margins(0.1)
-    _legend(axes)
-    return _png(figure)
+    add_legend(axes)
+    return to_png(figure)
 
 
 def _paired_bars(title: str, labels: Sequence[str], predicted: Sequence[Score], scaled: Sequence[Score]) -> bytes:
-    figure, (axes,) = _figure(6.4, 3.4)
+    figure, (axes,) = dark_figure(6.4, 3.4)
     places = np.arange(len(labels))
     for shift, scores, colour, label in (
-        (-0.2, predicted, _PREDICTED, "as predicted"),
-        (0.2, scaled, _SCALED, "median-scaled"),
+        (-0.2, predicted, BLUE, "as predicted"),
+        (0.2, scaled, YELLOW, "median-scaled"),
     ):
         heights = [score.metrics["abs_rel"] for score in scores]
         bars = axes.bar(places + shift, heights, 0.38, color=colour, label=label)
         texts = ["" if np.isnan(height) else f"{height:.2f}" for height in heights]
-        axes.bar_label(bars, texts, color=_TEXT, fontsize=7, padding=1)
+        axes.bar_label(bars, texts, color=TEXT, fontsize=7, padding=1)
     axes.set_xticks(places, labels, rotation=20 if len(labels) > 4 else 0, ha="right" if len(labels) > 4 else "center")
-    axes.set_title(title, loc="left", color=_TEXT, fontsize=11)
+    axes.set_title(title, loc="left", color=TEXT, fontsize=11)
     axes.margins(y=0.15)
-    _legend(axes)
-    return _png(figure)
+    add_legend(axes)
+    return to_png(figure)
 
 
 def _line(
@@ -108,7 +108,7 @@ def _name_recordings(axes: Axes, sets: Sequence[SetScore], starts: Sequence[int]
             xytext=(0, -3),
             textcoords="offset points",
             va="top",
-            color=_TEXT,
+            color=TEXT,
             fontsize=7,
             parse_math=False,
         )
@@ -118,24 +118,27 @@ def _of_all(cameras: Mapping[str, Mapping[str, Score]]) -> list[Score]:
     return [scores[ALL] for scores in cameras.values()]
 
 
-def _figure(width: float, height: float, rows: int = 1) -> tuple[Figure, list[Axes]]:
+def dark_figure(width: float, height: float, rows: int = 1) -> tuple[Figure, list[Axes]]:
+    """Return a figure of `width` x `height` inches in the pages' colours, with axes one below the other."""
     figure = Figure((width, height), dpi=_DPI, facecolor=_GROUND, layout="constrained")
     all_axes = [figure.add_subplot(rows, 1, row + 1, facecolor=_PANEL) for row in range(rows)]
     for axes in all_axes:
-        axes.tick_params(colors=_TEXT, labelsize=8)
-        axes.grid(axis="y", color=_LINES, linewidth=0.6)
+        axes.tick_params(colors=TEXT, labelsize=8)
+        axes.grid(axis="y", color=LINES, linewidth=0.6)
         axes.set_axisbelow(True)
         for spine in axes.spines.values():
-            spine.set_color(_LINES)
+            spine.set_color(LINES)
     return figure, all_axes
 
 
-def _legend(axes: Axes) -> None:
+def add_legend(axes: Axes) -> None:
+    """Name what is drawn, where it has names."""
     if axes.get_legend_handles_labels()[0]:
-        axes.legend(fontsize=8, facecolor=_PANEL, edgecolor=_LINES, labelcolor=_TEXT)
+        axes.legend(fontsize=8, facecolor=_PANEL, edgecolor=LINES, labelcolor=TEXT)
 
 
-def _png(figure: Figure) -> bytes:
+def to_png(figure: Figure) -> bytes:
+    """Return the figure as a file."""
     stream = io.BytesIO()
     figure.savefig(stream, format="png")
     return stream.getvalue()
