@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvcdepth_core.errors import ConfigError
-from cvcdepth_core.metrics import METRIC_NAMES
+from cvcdepth_core.metrics import METRIC_NAMES, metrics_of
 from cvcdepth_core.scores import ALL, Scaling, Scores
 
 SetValues = dict[tuple[str, int], NDArray[np.float64]]
@@ -111,12 +111,13 @@ def compare_values(
 
 def set_metrics(scores: Scores, cameras: Sequence[str], scaling: Scaling = "metric", group: str = ALL) -> SetValues:
     """Return each set's metrics [N, 7] by (recording, stamp), in the order of `cameras`; NaN without truth."""
-    index = {camera: i for i, camera in enumerate(cameras)}
-    found: dict[tuple[str, int], NDArray[np.float64]] = {}
-    for row in scores.images:
-        sets = found.setdefault((row.recording, row.stamp_ns), np.full((len(cameras), len(METRIC_NAMES)), np.nan))
-        if group in row.sums[scaling]:
-            sets[index[row.camera]] = list(row.sums[scaling][group].metrics().values())
+    column = scores.settings.groups.index(group)
+    found: SetValues = {}
+    for table in scores.images:
+        own = [metrics_of(table.of_camera(camera, scaling)[:, column]) for camera in cameras]
+        missing = np.full((len(table), len(METRIC_NAMES)), np.nan)
+        values = np.stack([metrics if len(metrics) else missing for metrics in own], axis=1)
+        found |= {(table.recording, stamp): values[i] for i, stamp in enumerate(table.stamps_ns.tolist())}
     return found
 
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, Literal, NamedTuple
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from cvcdepth_core.errors import ConfigError
 from cvcdepth_core.estimator import SurroundDepth
 from cvcdepth_core.geometry import back_project, transform
 from cvcdepth_core.losses import masked_mean
@@ -26,10 +25,12 @@ from cvcdepth_core.photometric import photometric_error
 from cvcdepth_core.poses import Pose, inverse
 from cvcdepth_core.preprocess import to_tensor
 from cvcdepth_core.rig import Rig
-from cvcdepth_core.scores import mean, sorted_rows
+from cvcdepth_core.scores import mean
 from cvcdepth_core.view_synthesis import align_intensity, sample, sampling_grid, warp_views
 
 Kind = Literal["spatial", "temporal"]
+Pair = tuple[Kind, str, str]
+"""Kind, camera, other camera."""
 
 _OCCLUDER_MARGIN = 0.05
 _EDGE = 0.1
@@ -87,13 +88,9 @@ def disagreement(view: PosedDepth, i: int, other: PosedDepth, j: int, max_depth:
     return found
 
 
-@dataclass(frozen=True)
-class AgreementRow:
-    """One comparison of an evaluation."""
+class AgreementRow(NamedTuple):
+    """One comparison of a set."""
 
-    recording: str
-    stamp_ns: int
-    """Of the set that the camera belongs to."""
     kind: Kind
     camera: str
     other: str
@@ -103,41 +100,57 @@ class AgreementRow:
     agreement: Agreement
 
     @property
-    def key(self) -> tuple[str, int, str, str, str]:
-        """What tells it from all other rows."""
-        return self.recording, self.stamp_ns, self.kind, self.camera, self.other
-
-    def to_json(self) -> dict[str, Any]:
-        """Return it with JSON's types; what is NaN is null."""
-        numbers = {name: None if math.isnan(number) else number for name, number in self.agreement._asdict().items()}
-        return asdict(self) | {"agreement": numbers}
-
-    @classmethod
-    def from_json(cls, row: dict[str, Any]) -> AgreementRow:
-        """Undo `to_json`; ConfigError when `row` was not written by it."""
-        try:
-            numbers = [row["agreement"][name] for name in Agreement._fields]
-            pixels, *others = (math.nan if number is None else number for number in numbers)
-            found = Agreement(int(pixels), *others)
-            return cls(**(row | {"agreement": found}))
-        except (KeyError, TypeError, AttributeError) as error:
-            raise ConfigError(f"agreement row: not what this version writes: {error!r}") from error
+    def pair(self) -> Pair:
+        """What was compared with what."""
+        return self.kind, self.camera, self.other
 
 
-def spatial_rows(recording: str, stamp_ns: int, rig: Rig, view: PosedDepth, max_depth: float) -> list[AgreementRow]:
+class AgreementTable:
+    """All comparisons of one recording, in columns: 42 bytes each."""
+
+    DTYPE = np.dtype(
+        [
+            ("set", "<u4"),
+            ("pair", "<u2"),
+            ("travelled", "<f8"),
+            ("pixels", "<u4"),
+            ("median", "<f8"),
+            ("percentile_90", "<f8"),
+            ("photometric", "<f8"),
+        ]
+    )
+    """`set` counts the sets of the recording, `pair` those of `pairs`; the rest as in `AgreementRow`."""
+
+    def __init__(self, pairs: Iterable[Pair] = (), columns: NDArray[np.void] | None = None) -> None:
+        self._pairs = {pair: number for number, pair in enumerate(pairs)}
+        self._columns = bytearray() if columns is None else bytearray(columns.astype(self.DTYPE).tobytes())
+
+    @property
+    def pairs(self) -> list[Pair]:
+        """What was compared with what."""
+        return list(self._pairs)
+
+    @property
+    def columns(self) -> NDArray[np.void]:
+        """All comparisons [M] of dtype `DTYPE`, in the order in which they were added."""
+        return np.frombuffer(bytes(self._columns), self.DTYPE)
+
+    def add(self, number: int, rows: Iterable[AgreementRow]) -> None:
+        """Add comparisons of the set of this number."""
+        found = [
+            (number, self._pairs.setdefault(row.pair, len(self._pairs)), row.travelled, *row.agreement) for row in rows
+        ]
+        self._columns += np.array(found, dtype=self.DTYPE).tobytes()
+
+
+def spatial_rows(rig: Rig, view: PosedDepth, max_depth: float) -> list[AgreementRow]:
     """Compare every camera of a set with its neighbours."""
-    return [
-        _row(recording, stamp_ns, "spatial", rig, (view, i), (view, j), max_depth) for i, j in rig.neighbour_indices
-    ]
+    return [_row("spatial", rig, (view, i), (view, j), max_depth) for i, j in rig.neighbour_indices]
 
 
-def temporal_rows(
-    recording: str, stamp_ns: int, rig: Rig, view: PosedDepth, earlier: PosedDepth, max_depth: float
-) -> list[AgreementRow]:
+def temporal_rows(rig: Rig, view: PosedDepth, earlier: PosedDepth, max_depth: float) -> list[AgreementRow]:
     """Compare every camera of a set with itself in an earlier set; both need poses in the same world."""
-    return [
-        _row(recording, stamp_ns, "temporal", rig, (view, i), (earlier, i), max_depth) for i in range(len(rig.cameras))
-    ]
+    return [_row("temporal", rig, (view, i), (earlier, i), max_depth) for i in range(len(rig.cameras))]
 
 
 class AgreementSummary(NamedTuple):
@@ -149,37 +162,29 @@ class AgreementSummary(NamedTuple):
     photometric: float
 
 
-def summarise_agreement(rows: Iterable[AgreementRow]) -> dict[tuple[Kind, str, str], AgreementSummary]:
-    """Return the means of every (kind, camera, other); they depend neither on the order nor on parts merged before.
+def summarise_agreement(tables: Iterable[AgreementTable]) -> dict[Pair, AgreementSummary]:
+    """Return the means of every pair; they depend neither on the order of the tables nor on that of the sets."""
+    by_pair: dict[Pair, list[NDArray[np.void]]] = {}
+    for table in tables:
+        columns = table.columns
+        for number, pair in enumerate(table.pairs):
+            by_pair.setdefault(pair, []).append(columns[columns["pair"] == number])
+    return {pair: _mean_agreement(np.concatenate(found)) for pair, found in by_pair.items()}
 
-    Raises ConfigError when a comparison occurs twice.
-    """
-    by_pair: dict[tuple[Kind, str, str], list[Agreement]] = {}
-    for row in sorted_rows(rows):
-        by_pair.setdefault((row.kind, row.camera, row.other), []).append(row.agreement)
-    return {pair: _mean_agreement(found) for pair, found in by_pair.items()}
 
-
-def _mean_agreement(found: Sequence[Agreement]) -> AgreementSummary:
-    compared = [agreement for agreement in found if agreement.pixels]
-    photometric = [agreement.photometric for agreement in found if not math.isnan(agreement.photometric)]
-    half, most = mean([a.median for a in compared]), mean([a.percentile_90 for a in compared])
-    return AgreementSummary(len(compared), half, most, mean(photometric))
+def _mean_agreement(found: NDArray[np.void]) -> AgreementSummary:
+    compared = found[found["pixels"] > 0]
+    photometric = found["photometric"][~np.isnan(found["photometric"])]
+    half, most = (mean(compared[name].tolist()) for name in ("median", "percentile_90"))
+    return AgreementSummary(len(compared), half, most, mean(photometric.tolist()))
 
 
 def _row(
-    recording: str,
-    stamp_ns: int,
-    kind: Kind,
-    rig: Rig,
-    first: tuple[PosedDepth, int],
-    second: tuple[PosedDepth, int],
-    max_depth: float,
+    kind: Kind, rig: Rig, first: tuple[PosedDepth, int], second: tuple[PosedDepth, int], max_depth: float
 ) -> AgreementRow:
     (view, i), (other, j) = first, second
     travelled = float(np.linalg.norm(view.world_T_camera[i, :3, 3] - other.world_T_camera[j, :3, 3]))
-    found = agreement(view, i, other, j, max_depth)
-    return AgreementRow(recording, stamp_ns, kind, rig.names[i], rig.names[j], travelled, found)
+    return AgreementRow(kind, rig.names[i], rig.names[j], travelled, agreement(view, i, other, j, max_depth))
 
 
 @dataclass(frozen=True)

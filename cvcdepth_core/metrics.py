@@ -13,6 +13,9 @@ from torch import Tensor
 
 METRIC_NAMES = ("abs_rel", "sq_rel", "rmse", "rmse_log", "delta_1", "delta_2", "delta_3")
 
+Sums = NDArray[np.void]
+"""`ErrorSums` as elements of an array, of dtype `SUMS`."""
+
 
 class ErrorSums(NamedTuple):
     """The errors of some pixels with known depth, added up."""
@@ -38,12 +41,20 @@ class ErrorSums(NamedTuple):
 
     def metrics(self) -> dict[str, float]:
         """Return the numbers of `METRIC_NAMES`; NaN where nothing was predicted."""
-        if self.predicted == 0:
-            return dict.fromkeys(METRIC_NAMES, math.nan)
-        n = self.predicted
-        roots = (math.sqrt(self.squared / n), math.sqrt(self.squared_log / n))
-        shares = (self.delta_1 / n, self.delta_2 / n, self.delta_3 / n)
-        return dict(zip(METRIC_NAMES, (self.abs_rel / n, self.sq_rel / n, *roots, *shares), strict=True))
+        return dict(zip(METRIC_NAMES, metrics_of(np.array(self, dtype=SUMS)).tolist(), strict=True))
+
+
+_COUNTED = ("truth", "predicted", "delta_1", "delta_2", "delta_3")
+SUMS = np.dtype([(name, "<u4" if name in _COUNTED else "<f8") for name in ErrorSums._fields])
+"""How arrays hold `ErrorSums`: 52 bytes each."""
+
+
+def metrics_of(sums: Sums) -> NDArray[np.float64]:
+    """Return the numbers of `METRIC_NAMES` [..., 7] of sums [...]; NaN where nothing was predicted."""
+    n = np.where(sums["predicted"] > 0, sums["predicted"], np.nan)
+    roots = (np.sqrt(sums["squared"] / n), np.sqrt(sums["squared_log"] / n))
+    shares = (sums[f"delta_{power}"] / n for power in (1, 2, 3))
+    return np.stack([sums["abs_rel"] / n, sums["sq_rel"] / n, *roots, *shares], axis=-1)
 
 
 def sum_errors(prediction: NDArray[np.float64], truth: NDArray[np.float64]) -> ErrorSums:

@@ -1,25 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """Depth scores of many images: measured in parts, merged exactly, written to JSON and back without loss.
 
-Every image (and every pool of images) is one row of sums and counts. Merging joins the rows, and means are taken with
-`math.fsum`, which rounds once; so a result depends neither on the number of workers nor on their order.
+Of every image (and every pool of images) there are sums and counts, of which nothing is added up any further. Means are
+taken with `math.fsum`, which rounds once; so a result depends neither on the number of workers nor on their order.
 """
 
 from __future__ import annotations
 
+import base64
 import math
-from collections import Counter
+import zlib
+from array import array
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, TypeVar
-from typing import Protocol as TypingProtocol
+from itertools import pairwise
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from cvcdepth_core.errors import ConfigError
-from cvcdepth_core.metrics import METRIC_NAMES, ErrorSums, median_ratio, sum_errors
+from cvcdepth_core.metrics import METRIC_NAMES, SUMS, ErrorSums, Sums, median_ratio, metrics_of, sum_errors
 
 Protocol = Literal["image", "pool"]
 """`image`: every image is one measurement (the field's). `pool`: the pixels of some consecutive images of a camera are,
@@ -29,29 +31,6 @@ Scaling = Literal["metric", "median"]
 SCALINGS: tuple[Scaling, ...] = ("metric", "median")
 
 ALL, OVERLAP = "all", "overlap"
-
-
-class Row(TypingProtocol):
-    """One line of results."""
-
-    @property
-    def key(self) -> tuple[Any, ...]:
-        """The recording's name, the set's stamp, and what tells the row from the others of that set."""
-
-
-RowType = TypeVar("RowType", bound=Row)
-
-
-def sorted_rows(rows: Iterable[RowType]) -> tuple[RowType, ...]:
-    """Sort by recording and time; the rows of a set, which always come together, keep the rig's order.
-
-    Raises ConfigError for a row that is there twice.
-    """
-    ordered = tuple(sorted(rows, key=lambda row: row.key[:2]))
-    twice = [key for key, count in Counter(row.key for row in ordered).items() if count > 1]
-    if twice:
-        raise ConfigError(f"scores: {', '.join(map(str, twice[0]))} was measured twice")
-    return ordered
 
 
 def mean(values: Sequence[float]) -> float:
@@ -104,36 +83,53 @@ class DepthSamples(NamedTuple):
     """[M] whether a neighbouring camera sees the point too."""
 
 
-@dataclass(frozen=True)
-class Measurement:
-    """The errors of one image, or of one pool of images, of one camera."""
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """What was measured of one recording, in columns: 0.7 kB for an image, or for a pool of images, of a camera."""
 
     recording: str
-    stamp_ns: int
-    """Of the set that the image (the pool's first) belongs to."""
-    camera: str
-    scale: float
-    """median(truth) / median(prediction), NaN where nothing was predicted."""
-    sums: Mapping[Scaling, Mapping[str, ErrorSums]]
-    """By scaling and group; a group without truth is absent."""
+    cameras: tuple[str, ...]
+    stamps_ns: NDArray[np.int64]
+    """[S] of the set that the images (a pool's first ones) belong to."""
+    scales: NDArray[np.float64]
+    """[S, N] median(truth) / median(prediction), NaN where nothing was predicted."""
+    sums: Sums
+    """[S, N, 2, G] by scaling (`SCALINGS`) and group (`ScoreSettings.groups`)."""
 
-    @property
-    def key(self) -> tuple[str, int, str]:
-        """What tells it from all other measurements."""
-        return self.recording, self.stamp_ns, self.camera
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    def of_camera(self, camera: str, scaling: Scaling) -> Sums:
+        """Return the sums [S, G] of one camera, [0, G] where the rig has no such camera."""
+        if camera not in self.cameras:
+            return self.sums[:0, 0, 0]
+        return self.sums[:, self.cameras.index(camera), SCALINGS.index(scaling)]
 
     def to_json(self) -> dict[str, Any]:
-        """Return it with JSON's types; sums are lists in the order of `ErrorSums`."""
-        sums = {scaling: {group: list(s) for group, s in groups.items()} for scaling, groups in self.sums.items()}
-        scale = None if math.isnan(self.scale) else self.scale
-        return {"recording": self.recording, "stamp_ns": self.stamp_ns, "camera": self.camera, "scale": scale} | sums
+        """Return it with JSON's types: the columns compressed, as the bytes of little-endian numbers."""
+        columns = b"".join(
+            np.ascontiguousarray(column).tobytes() for column in (self.stamps_ns, self.scales, self.sums)
+        )
+        packed = base64.b64encode(zlib.compress(columns)).decode("ascii")
+        shape = {"sets": len(self), "groups": self.sums.shape[-1]}
+        return {"recording": self.recording, "cameras": list(self.cameras), **shape, "columns": packed}
 
     @classmethod
-    def from_json(cls, row: Mapping[str, Any]) -> Measurement:
+    def from_json(cls, content: Mapping[str, Any]) -> Measurements:
         """Undo `to_json`."""
-        sums = {scaling: {group: ErrorSums(*s) for group, s in row[scaling].items()} for scaling in SCALINGS}
-        scale = math.nan if row["scale"] is None else row["scale"]
-        return cls(row["recording"], row["stamp_ns"], row["camera"], scale, sums)
+        cameras, sets, groups = tuple(content["cameras"]), int(content["sets"]), int(content["groups"])
+        shapes: dict[np.dtype[Any], tuple[int, ...]] = {
+            np.dtype("<i8"): (sets,),
+            np.dtype("<f8"): (sets, len(cameras)),
+            SUMS: (sets, len(cameras), len(SCALINGS), groups),
+        }
+        packed = zlib.decompress(base64.b64decode(content["columns"], validate=True))
+        columns, offset = [], 0
+        for dtype, shape in shapes.items():
+            column = np.frombuffer(packed, dtype, math.prod(shape), offset).reshape(shape)
+            offset += column.nbytes
+            columns.append(column)
+        return cls(str(content["recording"]), cameras, *columns)
 
 
 class Score(NamedTuple):
@@ -171,19 +167,19 @@ class Summary(NamedTuple):
         return {"mean": _json_by_group(self.mean), "cameras": cameras}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scores:
-    """The rows of one or many recordings, sorted by recording and time."""
+    """What was measured of one or many recordings, sorted by their names."""
 
     settings: ScoreSettings
-    images: tuple[Measurement, ...]
-    pools: tuple[Measurement, ...]
+    images: tuple[Measurements, ...]
+    pools: tuple[Measurements, ...]
 
     @classmethod
     def merged(cls, parts: Iterable[Scores]) -> Scores:
         """Join parts measured anywhere, in any order.
 
-        Raises ConfigError when there is none, their settings differ, or an image was measured twice.
+        Raises ConfigError when there is none, their settings differ, or a recording was measured twice.
         """
         parts = list(parts)
         if not parts:
@@ -192,24 +188,24 @@ class Scores:
         for other in parts[1:]:
             if other.settings != settings:
                 raise ConfigError(f"scores: settings {other.settings} and {settings} cannot be merged")
-        return cls(
-            settings,
-            sorted_rows(row for part in parts for row in part.images),
-            sorted_rows(row for part in parts for row in part.pools),
-        )
+        images = _by_recording(table for part in parts for table in part.images)
+        return cls(settings, images, _by_recording(table for part in parts for table in part.pools))
 
     @property
     def cameras(self) -> list[str]:
         """The cameras' names, in the rig's order."""
-        return list(dict.fromkeys(row.camera for row in self.images))
+        return list(dict.fromkeys(camera for table in self.images if len(table) for camera in table.cameras))
 
     def summary(self, protocol: Protocol = "image", scaling: Scaling = "metric") -> Summary:
         """Take the means: per camera over its measurements, then over the cameras."""
-        rows = self.images if protocol == "image" else self.pools
+        tables = self.images if protocol == "image" else self.pools
         cameras = {}
         for camera in self.cameras:
-            own = [row.sums[scaling] for row in rows if row.camera == camera]
-            cameras[camera] = {g: _camera_score([s[g] for s in own if g in s]) for g in self.settings.groups}
+            own = [table.of_camera(camera, scaling) for table in tables]
+            cameras[camera] = {
+                group: _camera_score(np.concatenate([sums[:, index] for sums in own]))
+                for index, group in enumerate(self.settings.groups)
+            }
         mean = {g: _mean_score([scores[g] for scores in cameras.values()]) for g in self.settings.groups}
         return Summary(cameras, mean)
 
@@ -217,17 +213,17 @@ class Scores:
         """Return everything with JSON's types."""
         return {
             "settings": self.settings.model_dump(mode="json"),
-            "images": [row.to_json() for row in self.images],
-            "pools": [row.to_json() for row in self.pools],
+            "images": [table.to_json() for table in self.images],
+            "pools": [table.to_json() for table in self.pools],
         }
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> Scores:
         """Undo `to_json`. Raises ConfigError when `content` was not written by it."""
         try:
-            images, pools = (tuple(map(Measurement.from_json, content[key])) for key in ("images", "pools"))
+            images, pools = (tuple(map(Measurements.from_json, content[key])) for key in ("images", "pools"))
             return cls(ScoreSettings.model_validate(content["settings"]), images, pools)
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, zlib.error) as error:
             raise ConfigError(f"scores: not what this version writes: {error!r}") from error
 
 
@@ -236,49 +232,71 @@ class SurroundScorer:
 
     def __init__(self, recording: str, cameras: Sequence[str], settings: ScoreSettings) -> None:
         """Name the `recording` as no other recording of the evaluation is named."""
-        self._recording = recording
-        self._cameras = tuple(cameras)
         self._settings = settings
-        self._images: list[Measurement] = []
-        self._pools: list[Measurement] = []
+        self._cameras = tuple(cameras)
+        self._images, self._pools = (_Columns(recording, self._cameras, len(settings.groups)) for _ in range(2))
         self._pooled_sets: list[tuple[int, Sequence[DepthSamples]]] = []
 
-    def add(self, stamp_ns: int, samples: Sequence[DepthSamples]) -> list[Measurement]:
-        """Measure one set, `samples` in the order of the cameras; return its rows.
+    def add(self, stamp_ns: int, samples: Sequence[DepthSamples]) -> int:
+        """Measure one set, `samples` in the order of the cameras; return how many pixels have truth inside the limits.
 
         Raises ConfigError when there is not one for each camera.
         """
         if len(samples) != len(self._cameras):
             raise ConfigError(f"scores: samples of {len(samples)} cameras, expected {len(self._cameras)}")
         valid = [_within_limits(image, self._settings) for image in samples]
-        measured = self._measure(stamp_ns, valid)
-        self._images += measured
+        self._images.add(stamp_ns, *self._measure(valid))
         self._pooled_sets.append((stamp_ns, valid))
         if len(self._pooled_sets) == self._settings.pool:
             self._close_pool()
-        return measured
+        return sum(len(image.truth) for image in valid)
 
     def scores(self) -> Scores:
         """Return what was measured so far."""
-        return Scores(self._settings, sorted_rows(self._images), sorted_rows(self._pools))
+        return Scores(self._settings, (self._images.table(),), (self._pools.table(),))
 
     def _close_pool(self) -> None:
         stamps, sets = zip(*self._pooled_sets, strict=True)
         joined = [DepthSamples(*map(np.concatenate, zip(*images, strict=True))) for images in zip(*sets, strict=True)]
-        self._pools += self._measure(stamps[0], joined)
+        self._pools.add(stamps[0], *self._measure(joined))
         self._pooled_sets.clear()
 
-    def _measure(self, stamp_ns: int, samples: Sequence[DepthSamples]) -> list[Measurement]:
-        rows = []
-        for camera, image in zip(self._cameras, samples, strict=True):
+    def _measure(self, samples: Sequence[DepthSamples]) -> tuple[list[float], Sums]:
+        """Return the scales [N] and the sums [N, 2, G]."""
+        scales, sums = [], []
+        for image in samples:
             scale = median_ratio(image.prediction, image.truth)
-            scaled = _clamp(image.prediction * scale, self._settings)
-            sums: dict[Scaling, dict[str, ErrorSums]] = {
-                "metric": _sums_by_group(image, self._settings),
-                "median": _sums_by_group(image._replace(prediction=scaled), self._settings),
-            }
-            rows.append(Measurement(self._recording, stamp_ns, camera, scale, sums))
-        return rows
+            scaled = image._replace(prediction=_clamp(image.prediction * scale, self._settings))
+            scales.append(scale)
+            sums.append([_sums_by_group(found, self._settings) for found in (image, scaled)])
+        return scales, np.array(sums, dtype=SUMS)
+
+
+class _Columns:
+    """The columns of `Measurements` while they grow."""
+
+    def __init__(self, recording: str, cameras: tuple[str, ...], groups: int) -> None:
+        self._recording, self._cameras, self._groups = recording, cameras, groups
+        self._stamps, self._scales, self._sums = array("q"), array("d"), bytearray()
+
+    def add(self, stamp_ns: int, scales: Sequence[float], sums: Sums) -> None:
+        self._stamps.append(stamp_ns)
+        self._scales.extend(scales)
+        self._sums += sums.tobytes()
+
+    def table(self) -> Measurements:
+        cameras = len(self._cameras)
+        sums = np.frombuffer(bytes(self._sums), SUMS).reshape(-1, cameras, len(SCALINGS), self._groups)
+        scales = np.array(self._scales, dtype=np.float64).reshape(-1, cameras)
+        return Measurements(self._recording, self._cameras, np.array(self._stamps, dtype=np.int64), scales, sums)
+
+
+def _by_recording(tables: Iterable[Measurements]) -> tuple[Measurements, ...]:
+    ordered = tuple(sorted(tables, key=lambda table: table.recording))
+    for one, following in pairwise(ordered):
+        if one.recording == following.recording:
+            raise ConfigError(f"scores: {one.recording} was measured twice")
+    return ordered
 
 
 def _within_limits(image: DepthSamples, settings: ScoreSettings) -> DepthSamples:
@@ -293,19 +311,19 @@ def _clamp(prediction: NDArray[np.float64], settings: ScoreSettings) -> NDArray[
     return clamped
 
 
-def _sums_by_group(image: DepthSamples, settings: ScoreSettings) -> dict[str, ErrorSums]:
-    """Add up the errors of every group that has truth."""
+def _sums_by_group(image: DepthSamples, settings: ScoreSettings) -> list[ErrorSums]:
+    """Add up the errors of every group."""
     bins = np.digitize(image.truth, settings.range_edges)
-    masks = {ALL: np.ones(len(image.truth), dtype=bool)}
-    masks |= {name: bins == i for i, name in enumerate(settings.range_names, start=1)}
-    masks[OVERLAP] = image.overlap
-    return {g: sum_errors(image.prediction[mask], image.truth[mask]) for g, mask in masks.items() if mask.any()}
+    ranges = [bins == i for i, _ in enumerate(settings.range_names, start=1)]
+    masks = [np.ones(len(image.truth), dtype=bool), *ranges, image.overlap]
+    return [sum_errors(image.prediction[mask], image.truth[mask]) for mask in masks]
 
 
-def _camera_score(sums: Sequence[ErrorSums]) -> Score:
-    measured = [s.metrics() for s in sums if s.predicted]
-    truth, predicted = sum(s.truth for s in sums), sum(s.predicted for s in sums)
-    return Score(_means(measured), predicted / truth if truth else math.nan, truth, len(measured))
+def _camera_score(sums: Sums) -> Score:
+    measured = metrics_of(sums[sums["predicted"] > 0])
+    truth, predicted = (int(sums[name].sum(dtype=np.int64)) for name in ("truth", "predicted"))
+    metrics = {name: mean(measured[:, i].tolist()) for i, name in enumerate(METRIC_NAMES)}
+    return Score(metrics, predicted / truth if truth else math.nan, truth, len(measured))
 
 
 def _mean_score(scores: Sequence[Score]) -> Score:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Consistency on a ray-cast street: flat ground, a far wall, and a post in front of it."""
 
-import json
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +14,7 @@ from cvcdepth_core.calibration import Calibration
 from cvcdepth_core.consistency import (
     Agreement,
     AgreementRow,
+    AgreementTable,
     PosedDepth,
     agreement,
     disagreement,
@@ -21,7 +22,6 @@ from cvcdepth_core.consistency import (
     summarise_agreement,
     temporal_rows,
 )
-from cvcdepth_core.errors import ConfigError
 from cvcdepth_core.estimator import SurroundDepth
 from cvcdepth_core.pointcloud import pixel_rays
 from cvcdepth_core.rig import Camera, Rig
@@ -170,7 +170,7 @@ def test_depth_agrees_along_the_recorded_motion_and_not_along_a_wrong_one():
         PosedDepth(p.surround, p.world_T_camera + np.pad(far_away[:, None], ((0, 1), (3, 0)))) for p in (earlier, later)
     ]
     for first, second in ((later, earlier), (shifted[1], shifted[0])):
-        rows = temporal_rows("drive", 100, RIG, first, second, 80.0)
+        rows = temporal_rows(RIG, first, second, 80.0)
         assert [(row.camera, row.other, row.kind) for row in rows] == [
             ("left", "left", "temporal"),
             ("right", "right", "temporal"),
@@ -180,7 +180,7 @@ def test_depth_agrees_along_the_recorded_motion_and_not_along_a_wrong_one():
             assert row.agreement.median < 1e-3
             assert row.agreement.photometric < 0.03
     still = PosedDepth(later.surround, earlier.world_T_camera)
-    assert temporal_rows("drive", 100, RIG, still, earlier, 80.0)[0].agreement.median > 0.02
+    assert temporal_rows(RIG, still, earlier, 80.0)[0].agreement.median > 0.02
 
 
 def test_the_vehicles_motion_between_two_exposures_is_taken_into_account():
@@ -199,29 +199,36 @@ def test_the_vehicles_motion_between_two_exposures_is_taken_into_account():
     assert agreement(unknown, 0, unknown, 1).median > 0.02
 
 
-def test_every_neighbour_pair_has_a_row_that_survives_json():
-    rows = spatial_rows("drive", 5, RIG, seen(), 80.0)
-    assert [(row.camera, row.other) for row in rows] == [("left", "right"), ("right", "left")]
+def test_every_neighbour_pair_has_a_row():
+    rows = spatial_rows(RIG, seen(), 80.0)
+    assert [row.pair for row in rows] == [("spatial", "left", "right"), ("spatial", "right", "left")]
     assert rows[0].travelled == pytest.approx(0.8)
-    rows.append(AgreementRow("drive", 6, "spatial", "left", "right", 0.8, Agreement(0, *[math.nan] * 3)))
-    again = [AgreementRow.from_json(json.loads(json.dumps(row.to_json(), allow_nan=False))) for row in rows]
-    assert [repr(row) for row in again] == [repr(row) for row in rows]
-    with pytest.raises(ConfigError, match="not what this version writes"):
-        AgreementRow.from_json({"recording": "drive"})
 
 
-@given(st.permutations(range(6)))
-def test_the_summary_is_the_mean_over_sets_in_any_order_and_passes_over_empty_ones(order):
+def compared(values: Sequence[float]) -> AgreementTable:
+    """A comparison of the same pair in every set, with nothing to compare where a value is NaN."""
+    table = AgreementTable()
+    for number, value in enumerate(values):
+        found = Agreement(0 if math.isnan(value) else 9, value, value, value)
+        table.add(number, [AgreementRow("spatial", "left", "right", 0.8, found)])
+    return table
+
+
+@given(st.permutations(range(6)), st.integers(0, 6))
+def test_the_summary_is_the_mean_over_sets_in_any_order_and_passes_over_empty_ones(order, cut):
     values = [0.1, 0.2, 0.7, 0.3, 1e-9, math.nan]
-    rows = [
-        AgreementRow("drive", i, "spatial", "left", "right", 0.8, Agreement(0 if math.isnan(v) else 9, v, v, v))
-        for i, v in enumerate(values)
-    ]
-    (summary,) = summarise_agreement([rows[i] for i in order]).values()
+    shuffled = [values[i] for i in order]
+    (summary,) = summarise_agreement([compared(shuffled[:cut]), compared(shuffled[cut:])]).values()
     assert summary == (5, *[math.fsum(values[:5]) / 5] * 3)
 
 
-def test_a_comparison_that_is_there_twice_is_refused():
-    row = AgreementRow("drive", 0, "spatial", "left", "right", 0.8, Agreement(1, 0.0, 0.0, 0.0))
-    with pytest.raises(ConfigError, match="drive, 0, spatial, left, right was measured twice"):
-        summarise_agreement([row, row])
+def test_a_table_keeps_every_number_and_can_be_made_again_from_its_columns():
+    table = compared([0.1, math.nan])
+    table.add(1, [AgreementRow("temporal", "left", "left", 1.5, Agreement(4_000_000, 0.5, 0.9, 1 / 3))])
+    again = AgreementTable(table.pairs, table.columns)
+    assert again.pairs == [("spatial", "left", "right"), ("temporal", "left", "left")]
+    rows = again.columns.tolist()
+    assert rows[0] == (0, 0, 0.8, 9, 0.1, 0.1, 0.1)
+    assert rows[1][:4] == (1, 0, 0.8, 0)
+    assert all(map(math.isnan, rows[1][4:]))
+    assert rows[2] == (1, 1, 1.5, 4_000_000, 0.5, 0.9, 1 / 3)

@@ -44,10 +44,10 @@ def test_every_point_of_the_ground_plane_lies_on_it_unless_it_is_at_the_far_limi
 def test_the_ground_agrees_between_all_neighbours_and_a_constant_does_not(rig):
     ground = PosedDepth.of(estimate(rig, ground_plane_depth(rig, height=192, width=320)), rig, None)
     constant = PosedDepth.of(estimate(rig, constant_depth(rig, height=192, width=320)), rig, None)
-    flat = spatial_rows("sample", 0, rig, ground, max_depth=30.0)
+    flat = spatial_rows(rig, ground, max_depth=30.0)
     assert all(row.agreement.percentile_90 < 1e-3 for row in flat if row.agreement.pixels)
     assert sum(row.agreement.pixels > 300 for row in flat) >= 8
-    for row in spatial_rows("sample", 0, rig, constant, max_depth=30.0):
+    for row in spatial_rows(rig, constant, max_depth=30.0):
         assert row.agreement.median > 0.02
 
 

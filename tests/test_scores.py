@@ -188,15 +188,28 @@ def test_merging_refuses_nothing_twice_the_same_and_different_settings():
     part = scored("drive", 2, 0)
     with pytest.raises(ConfigError, match="nothing to merge"):
         Scores.merged([])
-    with pytest.raises(ConfigError, match="drive, 0, front was measured twice"):
+    with pytest.raises(ConfigError, match="drive was measured twice"):
         Scores.merged([part, part])
     with pytest.raises(ConfigError, match="cannot be merged"):
         Scores.merged([part, scored("other", 2, 0, ScoreSettings(max_depth=200))])
 
 
-def test_foreign_json_is_refused():
+@pytest.mark.parametrize(
+    "change", [{"columns": "eJw="}, {"columns": "?"}, {"sets": 3}, {"groups": "x"}, {"cameras": 1}]
+)
+def test_foreign_json_is_refused(change):
+    content = scored("drive", 2, 0).to_json()
+    content["images"][0] |= change
+    with pytest.raises(ConfigError, match="not what this version writes"):
+        Scores.from_json(content)
     with pytest.raises(ConfigError, match="not what this version writes"):
         Scores.from_json({"settings": {}, "images": [{"recording": "x"}], "pools": []})
+
+
+def test_an_image_takes_a_kilobyte_and_not_more():
+    (images,), (pools,) = (part := scored("drive", 8, 0)).images, part.pools
+    used = sum(column.nbytes for table in (images, pools) for column in (table.stamps_ns, table.scales, table.sums))
+    assert used / (8 * len(CAMERAS)) < 1000
 
 
 def test_a_set_with_too_few_cameras_is_refused():

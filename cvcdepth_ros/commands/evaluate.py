@@ -11,6 +11,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from cvcdepth_core.atomic_file import write_atomically
 from cvcdepth_ros.commands.arguments import (
     add_json,
     add_quiet,
@@ -106,7 +107,7 @@ def _evaluation(arguments: argparse.Namespace) -> "tuple[dict[str, Any], str]":
     compared = []
     for folder, *_ in others:
         content, text = _comparison(first / _METRICS_FILE, folder / _METRICS_FILE)
-        (folder / _COMPARISON_FILE).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        write_atomically(folder / _COMPARISON_FILE, f"{json.dumps(content, indent=2)}\n".encode())
         compared.append((content, text))
     results = {"evaluations": [content for _, content, _ in found], "comparisons": [content for content, _ in compared]}
     return results, "\n\n".join([text for *_, text in found] + [text for _, text in compared])
@@ -129,7 +130,7 @@ def _evaluated(
     arguments: argparse.Namespace, settings: EvaluationSettings, folder: Path
 ) -> "tuple[Path, dict[str, Any], str]":
     """Write one model's results; return their folder and what to print."""
-    from cvcdepth_ros.evaluation.frames import to_csv
+    from cvcdepth_ros.evaluation.frames import write_csv
 
     if settings.untrained:
         warn("untrained: the network has random weights, and its depth means nothing")
@@ -138,8 +139,8 @@ def _evaluated(
     result = _result(arguments, settings, jobs, folder)
     content = result.to_json()
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / _METRICS_FILE).write_text(json.dumps(content) + "\n", encoding="utf-8")
-    (folder / _FRAMES_FILE).write_text(to_csv(result.images), encoding="utf-8")
+    write_atomically(folder / _METRICS_FILE, f"{json.dumps(content)}\n".encode())
+    write_csv(folder / _FRAMES_FILE, result.images)
     if with_report:
         from cvcdepth_ros.evaluation.report.page import write_report
 

@@ -4,18 +4,18 @@
 from __future__ import annotations
 
 import csv
-import io
 import math
-from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
-from cvcdepth_core.comparison import rank_correlation
-from cvcdepth_core.consistency import AgreementRow
-from cvcdepth_core.metrics import METRIC_NAMES
-from cvcdepth_core.scores import ALL, Measurement, Scores, mean
+import numpy as np
+from numpy.typing import NDArray
 
-Key = tuple[str, int, str]  # recording, stamp, camera
+from cvcdepth_core.comparison import rank_correlation
+from cvcdepth_core.consistency import AgreementTable
+from cvcdepth_core.metrics import METRIC_NAMES, metrics_of
+from cvcdepth_core.scores import ALL, Measurements, Scores, mean
 
 
 class LabelFree(NamedTuple):
@@ -53,9 +53,18 @@ class SetScore(NamedTuple):
     """One set: means over the cameras that have a value."""
 
     recording: str
+    number: int
+    """Of the recording's sets, from 0."""
     stamp_ns: int
     abs_rel: float
     label_free: LabelFree
+
+    @classmethod
+    def of(cls, number: int, images: Sequence[ImageScore]) -> SetScore:
+        """Take the means over a set's images."""
+        means = [_known_mean(values) for values in zip(*(image.label_free for image in images), strict=True)]
+        abs_rel = _known_mean([image.metrics["abs_rel"] for image in images])
+        return cls(images[0].recording, number, images[0].stamp_ns, abs_rel, LabelFree(*means))
 
     @property
     def rank(self) -> float:
@@ -63,21 +72,16 @@ class SetScore(NamedTuple):
         return self.label_free.spatial if math.isnan(self.abs_rel) else self.abs_rel
 
 
-def image_scores(scores: Scores, agreement: Iterable[AgreementRow]) -> list[ImageScore]:
-    """Join both kinds of rows."""
-    label_free = _label_free_by_image(agreement)
-    return [_image_score(row, label_free.get(row.key, LabelFree())) for row in scores.images]
-
-
-def set_scores(images: Iterable[ImageScore]) -> list[SetScore]:
-    """Take the means over the cameras, in the order of the images."""
-    by_set: dict[tuple[str, int], list[ImageScore]] = defaultdict(list)
-    for image in images:
-        by_set[image.recording, image.stamp_ns].append(image)
-    return [
-        SetScore(recording, stamp, _known_mean([i.metrics["abs_rel"] for i in found]), _mean_label_free(found))
-        for (recording, stamp), found in by_set.items()
-    ]
+def image_scores(scores: Scores, agreement: Sequence[AgreementTable]) -> Iterator[list[ImageScore]]:
+    """Give the scores of each set's images, set by set; `agreement` in the order of the scores' recordings."""
+    group = scores.settings.groups.index(ALL)
+    for table, compared in zip(scores.images, agreement, strict=True):
+        label_free = _label_free(compared, len(table), table.cameras)
+        for number in range(len(table)):
+            yield [
+                _image_score(table, number, camera, group, LabelFree(*label_free[number, camera].tolist()))
+                for camera in range(len(table.cameras))
+            ]
 
 
 def correlations(sets: Sequence[SetScore]) -> dict[str, float]:
@@ -89,49 +93,50 @@ def correlations(sets: Sequence[SetScore]) -> dict[str, float]:
     }
 
 
-def to_csv(images: Iterable[ImageScore]) -> str:
-    """Return a table with a line per image; numbers as Python writes them, nothing where there is none."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
+def write_csv(path: Path, images: Iterable[ImageScore]) -> None:
+    """Write a table with a line per image; numbers as Python writes them, nothing where there is none."""
     scaled = [f"{name}_median_scaled" for name in METRIC_NAMES]
     plain = ("recording", "stamp_ns", "camera", "truth_points", "coverage", "scale")
-    writer.writerow([*plain, *METRIC_NAMES, *scaled, *LabelFree._fields])
-    for image in images:
-        numbers = [image.coverage, image.scale, *image.metrics.values(), *image.scaled.values(), *image.label_free]
-        cells = ["" if math.isnan(number) else repr(number) for number in numbers]
-        writer.writerow([image.recording, image.stamp_ns, image.camera, image.truth_points, *cells])
-    return text.getvalue()
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow([*plain, *METRIC_NAMES, *scaled, *LabelFree._fields])
+        for image in images:
+            numbers = [image.coverage, image.scale, *image.metrics.values(), *image.scaled.values(), *image.label_free]
+            cells = ["" if math.isnan(number) else repr(number) for number in numbers]
+            writer.writerow([image.recording, image.stamp_ns, image.camera, image.truth_points, *cells])
 
 
-def _image_score(row: Measurement, label_free: LabelFree) -> ImageScore:
-    sums, scaled = (row.sums[scaling].get(ALL) for scaling in ("metric", "median"))
-    nothing = dict.fromkeys(METRIC_NAMES, math.nan)
+def _image_score(table: Measurements, number: int, camera: int, group: int, label_free: LabelFree) -> ImageScore:
+    sums = table.sums[number, camera, :, group]
+    truth, predicted = (int(sums[name][0]) for name in ("truth", "predicted"))
+    metric, median = (dict(zip(METRIC_NAMES, found, strict=True)) for found in metrics_of(sums).tolist())
     return ImageScore(
-        row.recording,
-        row.stamp_ns,
-        row.camera,
-        sums.truth if sums else 0,
-        sums.predicted / sums.truth if sums else math.nan,
-        row.scale,
-        sums.metrics() if sums else nothing,
-        scaled.metrics() if scaled else nothing,
+        table.recording,
+        int(table.stamps_ns[number]),
+        table.cameras[camera],
+        truth,
+        predicted / truth if truth else math.nan,
+        float(table.scales[number, camera]),
+        metric,
+        median,
         label_free,
     )
 
 
-def _label_free_by_image(agreement: Iterable[AgreementRow]) -> dict[Key, LabelFree]:
-    found: dict[Key, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for row in agreement:
-        numbers = found[row.recording, row.stamp_ns, row.camera]
-        numbers[row.kind].append(row.agreement.median)
-        numbers[f"{row.kind}_photometric"].append(row.agreement.photometric)
-    return {
-        key: LabelFree(*(_known_mean(numbers[name]) for name in LabelFree._fields)) for key, numbers in found.items()
-    }
-
-
-def _mean_label_free(images: Sequence[ImageScore]) -> LabelFree:
-    return LabelFree(*(_known_mean(values) for values in zip(*(image.label_free for image in images), strict=True)))
+def _label_free(compared: AgreementTable, sets: int, cameras: Sequence[str]) -> NDArray[np.float64]:
+    """Return the numbers [sets, N, 4] of `LabelFree`: of each kind the mean over the others that have a value."""
+    columns = compared.columns
+    kinds = np.array([kind for kind, _, _ in compared.pairs], dtype=np.str_)
+    places = np.array([cameras.index(camera) for _, camera, _ in compared.pairs], dtype=np.int64)
+    means = []
+    for column in ("median", "photometric"):
+        for kind in ("spatial", "temporal"):
+            known = columns[(kinds == kind)[columns["pair"]] & ~np.isnan(columns[column])]
+            place = known["set"] * np.int64(len(cameras)) + places[known["pair"]]
+            total = np.bincount(place, known[column], sets * len(cameras))
+            with np.errstate(invalid="ignore"):
+                means.append(total / np.bincount(place, minlength=sets * len(cameras)))
+    return np.stack(means, axis=-1).reshape(sets, len(cameras), len(LabelFree._fields))
 
 
 def _known_mean(values: Sequence[float]) -> float:

@@ -3,15 +3,19 @@
 
 from __future__ import annotations
 
+import json
+from array import array
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
-from cvcdepth_core.consistency import AgreementRow, PosedDepth, spatial_rows, temporal_rows
+from cvcdepth_core.consistency import AgreementTable, PosedDepth, spatial_rows, temporal_rows
 from cvcdepth_core.errors import RecordingError
 from cvcdepth_core.ground_truth import PinholeView, SparseDepth, overlap_pixels, sample_prediction
 from cvcdepth_core.poses import Pose
@@ -70,7 +74,7 @@ class MeasuredSet:
         return found
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RecordingScores:
     """All that was found out about one recording."""
 
@@ -78,29 +82,32 @@ class RecordingScores:
     summary: dict[str, Any]
     """What was read and used, with JSON's types."""
     scores: Scores
-    agreement: tuple[AgreementRow, ...]
-    log_times: dict[int, int]
-    """By the set's stamp, both ns."""
+    agreement: AgreementTable
+    log_times: NDArray[np.int64]
+    """[S] when each set was recorded, ns."""
 
-    def to_json(self) -> dict[str, Any]:
-        """Return everything with JSON's types."""
-        return {
+    def to_arrays(self) -> dict[str, NDArray[Any]]:
+        """Return everything as arrays that numpy stores without pickling."""
+        described = {
             "name": self.name,
             "summary": self.summary,
             "scores": self.scores.to_json(),
-            "agreement": [row.to_json() for row in self.agreement],
-            "log_times": [list(pair) for pair in self.log_times.items()],
+            "pairs": self.agreement.pairs,
         }
+        text = np.frombuffer(json.dumps(described).encode(), dtype=np.uint8)
+        return {"described": text, "agreement": self.agreement.columns, "log_times": self.log_times}
 
     @classmethod
-    def from_json(cls, content: dict[str, Any]) -> RecordingScores:
-        """Undo `to_json`."""
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> RecordingScores:
+        """Undo `to_arrays`; KeyError, ValueError or ConfigError where the arrays are others."""
+        described = json.loads(arrays["described"].tobytes())
+        pairs = [(kind, camera, other) for kind, camera, other in described["pairs"]]
         return cls(
-            content["name"],
-            content["summary"],
-            Scores.from_json(content["scores"]),
-            tuple(map(AgreementRow.from_json, content["agreement"])),
-            dict(content["log_times"]),
+            described["name"],
+            described["summary"],
+            Scores.from_json(described["scores"]),
+            AgreementTable(pairs, arrays["agreement"]),
+            arrays["log_times"],
         )
 
 
@@ -140,7 +147,7 @@ class RecordingEvaluation:
             scoring.add(measured)
             if progress is not None:
                 progress(min(1.0, (measured.log_time - start) / (stop - start)))
-        if not scoring.log_times:
+        if not scoring.sets:
             raise RecordingError(f"{self.job.path}: no set: {self.depths.why_no_set(*self.window)}")
         return scoring.result(_summary(self, scoring))
 
@@ -197,36 +204,41 @@ class _Scoring:
         self._job = job
         self._latencies = latencies
         self._scorer = SurroundScorer(job.name, cameras, job.settings.scores)
-        self._agreement: list[AgreementRow] = []
+        self._agreement = AgreementTable()
         self._earlier: tuple[int, PosedDepth] | None = None
-        self.log_times: dict[int, int] = {}
+        self._log_times = array("q")
         self.sets_with_truth = 0
         self.truth_points = 0
 
     def add(self, measured: MeasuredSet) -> None:
         """Score one set; sets come in order."""
         with self._latencies.measure("score"):
-            rows = self._scorer.add(measured.stamp_ns, measured.samples())
-        points = sum(row.sums["metric"]["all"].truth for row in rows if "all" in row.sums["metric"])
+            points = self._scorer.add(measured.stamp_ns, measured.samples())
         self.truth_points += points
         self.sets_with_truth += points > 0
-        self.log_times[measured.stamp_ns] = measured.log_time
         with self._latencies.measure("label-free"), torch.inference_mode():
             self._compare(measured)
+        self._log_times.append(measured.log_time)
+
+    @property
+    def sets(self) -> int:
+        """Sets that were scored."""
+        return len(self._log_times)
 
     def result(self, summary: dict[str, Any]) -> RecordingScores:
         """Return what was found."""
-        return RecordingScores(self._job.name, summary, self._scorer.scores(), tuple(self._agreement), self.log_times)
+        log_times = np.array(self._log_times, dtype=np.int64)
+        return RecordingScores(self._job.name, summary, self._scorer.scores(), self._agreement, log_times)
 
     def _compare(self, measured: MeasuredSet) -> None:
-        name, stamp, rig, posed = self._job.name, measured.stamp_ns, measured.estimated.rig, measured.posed
+        stamp, rig, posed = measured.stamp_ns, measured.estimated.rig, measured.posed
         limit = self._job.settings.max_depth
-        self._agreement += spatial_rows(name, stamp, rig, posed, limit)
+        self._agreement.add(self.sets, spatial_rows(rig, posed, limit))
         if measured.world_T_base is None:
             self._earlier = None
             return
         if self._earlier is not None and stamp - self._earlier[0] <= _LONGEST_STEP_NS:
-            self._agreement += temporal_rows(name, stamp, rig, posed, self._earlier[1], limit)
+            self._agreement.add(self.sets, temporal_rows(rig, posed, self._earlier[1], limit))
         self._earlier = stamp, posed
 
 
@@ -243,7 +255,7 @@ def _summary(evaluation: RecordingEvaluation, scoring: _Scoring) -> dict[str, An
         "lidar": list(truth.topics),
         "motion": truth.motion.topic if truth.motion else None,
         "sets": {
-            "scored": len(scoring.log_times),
+            "scored": scoring.sets,
             "with_truth": scoring.sets_with_truth,
             "matched": statistics.sets,
             "incomplete": sum(statistics.cameras[replay.layout.anchor_camera].dropped.values()),

@@ -5,22 +5,23 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from cvcdepth_core.comparison import Comparison, compare
-from cvcdepth_core.consistency import AgreementRow, summarise_agreement
+from cvcdepth_core.consistency import AgreementTable, summarise_agreement
 from cvcdepth_core.errors import ConfigError, RecordingError
-from cvcdepth_core.scores import SCALINGS, Scaling, Scores, Summary, sorted_rows
+from cvcdepth_core.scores import SCALINGS, Scaling, Scores, Summary
 from cvcdepth_core.scores import Protocol as ScoreProtocol
-from cvcdepth_ros.evaluation.frames import ImageScore, SetScore, correlations, image_scores, set_scores
+from cvcdepth_ros.evaluation.frames import ImageScore, SetScore, correlations, image_scores
 from cvcdepth_ros.evaluation.job import Dependencies, EvaluationJob
 from cvcdepth_ros.evaluation.recording import RecordingScores
 
-SCHEMA = 1
+SCHEMA = 2
 PROTOCOLS: tuple[ScoreProtocol, ...] = ("image", "pool")
 
 
@@ -76,20 +77,21 @@ class EvaluationResult:
         """The rows of all recordings."""
         return Scores.merged(recording.scores for recording in self.recordings)
 
-    @cached_property
-    def agreement(self) -> tuple[AgreementRow, ...]:
+    @property
+    def agreement(self) -> list[AgreementTable]:
         """The label-free comparisons of all recordings."""
-        return sorted_rows(row for recording in self.recordings for row in recording.agreement)
+        return [recording.agreement for recording in self.recordings]
 
-    @cached_property
-    def images(self) -> list[ImageScore]:
-        """All scores, image by image."""
-        return image_scores(self.scores, self.agreement)
+    @property
+    def images(self) -> Iterator[ImageScore]:
+        """All scores, image by image; made while they are asked for."""
+        return chain.from_iterable(image_scores(self.scores, self.agreement))
 
     @cached_property
     def sets(self) -> list[SetScore]:
         """All scores, set by set."""
-        return set_scores(self.images)
+        numbers = chain.from_iterable(range(len(table)) for table in self.scores.images)
+        return list(map(SetScore.of, numbers, image_scores(self.scores, self.agreement)))
 
     def summary(self, protocol: ScoreProtocol = "image", scaling: Scaling = "metric") -> Summary:
         """Take the means over all recordings."""

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import logging
 import multiprocessing
@@ -13,6 +14,9 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
 
 from cvcdepth_core.atomic_file import write_atomically
 from cvcdepth_core.errors import CvcDepthError
@@ -36,9 +40,10 @@ class KeptParts:
     def load(self, job: EvaluationJob) -> RecordingScores | None:
         """Return the scores of a former run; None where there are none, or of another work."""
         try:
-            content = json.loads(self._path(job).read_text(encoding="utf-8"))
-            return RecordingScores.from_json(content["scores"]) if content["work"] == self._work(job) else None
-        except (OSError, ValueError, KeyError, TypeError, CvcDepthError):
+            with np.load(self._path(job), allow_pickle=False) as arrays:
+                known = json.loads(arrays["work"].tobytes()) == self._work(job)
+                return RecordingScores.from_arrays(arrays) if known else None
+        except (OSError, ValueError, KeyError, TypeError, BadZipFile, CvcDepthError):
             return None  # not there, or cut by whatever ended the former run: then the work is done again
 
     def save(self, job: EvaluationJob, scores: RecordingScores) -> None:
@@ -48,10 +53,13 @@ class KeptParts:
         except OSError:
             return  # the recording cannot be reached any more, so nobody can know it again
         self._folder.mkdir(parents=True, exist_ok=True)
-        write_atomically(self._path(job), json.dumps({"work": work, "scores": scores.to_json()}).encode())
+        content = io.BytesIO()
+        arrays: dict[str, Any] = {"work": np.frombuffer(json.dumps(work).encode(), dtype=np.uint8)} | scores.to_arrays()
+        np.savez(content, **arrays)
+        write_atomically(self._path(job), content.getvalue())
 
     def _path(self, job: EvaluationJob) -> Path:
-        return self._folder / f"{hashlib.sha256(job.name.encode()).hexdigest()[:16]}.json"
+        return self._folder / f"{hashlib.sha256(job.name.encode()).hexdigest()[:16]}.npz"
 
     def _work(self, job: EvaluationJob) -> dict[str, Any]:
         masks = [str(camera.mask) for camera in job.layout.cameras if camera.mask] if job.layout else []

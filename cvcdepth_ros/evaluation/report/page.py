@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import jinja2
 import numpy as np
 
+from cvcdepth_core.atomic_file import write_atomically
 from cvcdepth_core.consistency import summarise_agreement
 from cvcdepth_core.errors import CvcDepthError
 from cvcdepth_core.metrics import METRIC_NAMES
@@ -50,7 +51,7 @@ class ShownSet(NamedTuple):
 def write_report(path: Path, result: EvaluationResult, jobs: Mapping[str, EvaluationJob]) -> None:
     """Write the page; the jobs, by recording, are there to measure the sets again that it shows."""
     shown = [_shown(title, score, result, jobs[score.recording]) for title, score in chosen_sets(result.sets)]
-    path.write_text(render(result, shown), encoding="utf-8")
+    write_atomically(path, render(result, shown).encode())
 
 
 def chosen_sets(sets: Sequence[SetScore]) -> list[tuple[str, SetScore]]:
@@ -66,7 +67,7 @@ def render(result: EvaluationResult, shown: Sequence[ShownSet]) -> str:
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader(__package__), autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
     )
-    environment.filters |= {"number": _number, "data_url": _data_url}
+    environment.filters |= {"number": to_number, "data_url": to_data_url}
     return environment.get_template("report.html").render(
         result=result,
         shown=shown,
@@ -85,13 +86,18 @@ def render(result: EvaluationResult, shown: Sequence[ShownSet]) -> str:
 
 
 def _shown(title: str, score: SetScore, result: EvaluationResult, job: EvaluationJob) -> ShownSet:
-    recording = next(found for found in result.recordings if found.name == score.recording)
     try:
-        measured = measured_set(job, score.stamp_ns, recording.log_times[score.stamp_ns])
-        pictures = draw_set(measured, f"{title}: {score.recording}", job.settings.max_depth)
+        pictures = drawn_again(title, score, result, job)
     except (CvcDepthError, OSError) as error:
         return ShownSet(title, score, None, str(error))
     return ShownSet(title, score, pictures, "")
+
+
+def drawn_again(title: str, score: SetScore, result: EvaluationResult, job: EvaluationJob) -> SetPictures:
+    """Measure a set of a result once more, for its pictures; the errors of the family say why that is not possible."""
+    recording = next(found for found in result.recordings if found.name == score.recording)
+    measured = measured_set(job, score.stamp_ns, int(recording.log_times[score.number]))
+    return draw_set(measured, f"{title}: {score.recording}", job.settings.max_depth)
 
 
 def _with_most_tiles(shown: Sequence[ShownSet]) -> ShownSet | None:
@@ -146,9 +152,11 @@ def _css(colours: np.ndarray) -> str:
     return ", ".join("rgb({}, {}, {})".format(*colour) for colour in colours.tolist())
 
 
-def _number(value: float, digits: int = 3) -> str:
+def to_number(value: float, digits: int = 3) -> str:
+    """Return a number as pages show it; a dash for NaN."""
     return "–" if math.isnan(value) else f"{value:.{digits}f}"
 
 
-def _data_url(content: bytes, kind: str) -> str:
+def to_data_url(content: bytes, kind: str) -> str:
+    """Return a picture of this kind (png, jpeg) as an address that holds it."""
     return f"data:image/{kind};base64,{base64.b64encode(content).decode('ascii')}"
