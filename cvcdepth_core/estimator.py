@@ -4,14 +4,14 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from cvcdepth_core.checkpoint import DepthModelSpec, load_checkpoint
-from cvcdepth_core.errors import ConfigError
+from cvcdepth_core.engines import Precision, build_engine, resolve_device  # noqa: F401 - used from here elsewhere
 from cvcdepth_core.images import Picture
 from cvcdepth_core.networks import DepthNet, disparity_to_depth
 from cvcdepth_core.preprocess import SurroundPreprocessor, to_tensor
@@ -60,43 +60,74 @@ class DepthPredictor(Protocol):
 
 
 class DepthEstimator:
-    """A depth network on a device."""
+    """A depth network, run by one of the engines."""
 
-    def __init__(self, network: DepthNet, spec: DepthModelSpec, model_id: str, device: str = "auto") -> None:
-        """`model_id` is what reports call the weights; ConfigError when `device` does not exist here."""
+    def __init__(
+        self,
+        network: DepthNet,
+        spec: DepthModelSpec,
+        weights_id: str,
+        device: str = "auto",
+        backend: str = "auto",
+        precision: Precision = "float32",
+        cpu_without_memory: bool = False,
+    ) -> None:
+        """`weights_id` is what reports call the weights; for the rest, and the errors raised, see `build_engine`."""
         self.spec = spec
-        self.model_id = model_id
-        self.device = resolve_device(device)
-        self._network = network.eval().to(self.device)
+        self.weights_id = weights_id
+        self._engine = build_engine(network, spec, device, backend, precision, cpu_without_memory)
 
     @classmethod
-    def from_checkpoint(cls, path: Path, device: str = "auto") -> "DepthEstimator":
-        """Load a checkpoint file; CheckpointError names what is wrong with it."""
+    def from_checkpoint(cls, path: Path, device: str = "auto", **engine: Any) -> "DepthEstimator":
+        """Load a checkpoint file; CheckpointError names what is wrong with it. `engine` is as for the constructor."""
         checkpoint = load_checkpoint(path)
-        model_id = f"{checkpoint.path.name} sha256:{checkpoint.sha256[:12]}"
-        return cls(checkpoint.build_depth_net(), checkpoint.spec, model_id, device)
+        weights_id = f"{checkpoint.path.name} sha256:{checkpoint.sha256[:12]}"
+        return cls(checkpoint.build_depth_net(), checkpoint.spec, weights_id, device, **engine)
 
     @classmethod
-    def untrained(cls, spec: DepthModelSpec, device: str = "auto", seed: int = 0) -> "DepthEstimator":
+    def untrained(cls, spec: DepthModelSpec, device: str = "auto", seed: int = 0, **engine: Any) -> "DepthEstimator":
         """Build a network with random weights: its depth has the right form and no meaning."""
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            network = DepthNet(spec.encoder)
-        return cls(network, spec, f"untrained {spec.encoder} (random weights, seed {seed})", device)
+        return cls(
+            untrained_network(spec.encoder, seed),
+            spec,
+            f"untrained {spec.encoder} (random weights, seed {seed})",
+            device,
+            **engine,
+        )
+
+    @property
+    def model_id(self) -> str:
+        """What reports call the weights and what runs them."""
+        return f"{self.weights_id} with {self._engine.name}"
+
+    @property
+    def device(self) -> torch.device:
+        """Where inference runs."""
+        return self._engine.device
 
     def estimate(self, pictures: Sequence[Picture], fx: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Return depth [N, H, W] in metres of RGB pictures [H, W, 3]; `fx` [N] is in pixels of those pictures."""
-        images = to_tensor(pictures, self.device)
+        """Return depth [N, H, W] in metres of RGB pictures [H, W, 3]; `fx` [N] is in pixels of those pictures.
+
+        On a CPU a picture's depth does not depend on the others. Raises EngineError when memory is too small.
+        """
         with torch.inference_mode():
+            disparity = self._engine.disparity(to_tensor(pictures, self.device))
             depth = disparity_to_depth(
-                self._network(images),
-                torch.as_tensor(fx, dtype=torch.float32, device=self.device),
+                disparity,
+                torch.as_tensor(fx, dtype=torch.float32, device=disparity.device),
                 self.spec.min_depth,
                 self.spec.max_depth,
                 self.spec.focal_scale,
             )
         metres: NDArray[np.float32] = depth[:, 0].cpu().numpy()
         return metres
+
+
+def untrained_network(encoder: str, seed: int = 0) -> DepthNet:
+    """Return a depth network whose weights are random and always the same."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return DepthNet(encoder)
 
 
 class SurroundDepthEstimator:
@@ -132,15 +163,3 @@ class SurroundDepthEstimator:
             np.copyto(surround.depth[index], depth, where=valid[index])
             surround.pictures[index] = picture
         return surround
-
-
-def resolve_device(name: str) -> torch.device:
-    """Return the device of that name, `auto` being CUDA where there is one; ConfigError when it is not there."""
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        device = torch.device(name)
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:
-        raise ConfigError(f"device: '{name}' is not available: {str(error).splitlines()[0]}") from error
-    return device

@@ -41,21 +41,28 @@ class ModelSettings(Settings):
     """Untrained network only: columns of its input. A checkpoint names its own."""
     device: str = "auto"
     """Where inference runs: auto (CUDA where there is one), cpu, cuda, cuda:1 ..."""
+    backend: Literal["auto", "ncnn", "torch", "torch_eager", "torch_compiled", "onnxruntime", "tensorrt"] = "auto"
+    """What runs the network: auto (on a CPU ncnn where it is installed, else torch) or one by name."""
+    precision: Literal["float32", "bfloat16", "float16"] = "float32"
+    """In what a CUDA device computes; CPUs know float32 only."""
+    cpu_without_memory: bool = False
+    """Go on with the CPU, more slowly, when the GPU's memory is too small even for one camera."""
 
     def build_estimator(self) -> "DepthEstimator":
         """Load the checkpoint, or make the untrained network; CheckpointError or ConfigError says what is wrong."""
         from cvcdepth_core.checkpoint import DepthModelSpec
         from cvcdepth_core.estimator import DepthEstimator
 
+        engine = self.model_dump(include={"backend", "precision", "cpu_without_memory"})
         if not self.untrained:
-            return DepthEstimator.from_checkpoint(Path(self.checkpoint).expanduser(), self.device)
+            return DepthEstimator.from_checkpoint(Path(self.checkpoint).expanduser(), self.device, **engine)
         try:
             spec = DepthModelSpec(
                 encoder=self.encoder, height=self.height, width=self.width, min_depth=1.5, max_depth=200.0
             )
         except ValidationError as error:
             raise ConfigError(f"parameter {first_validation_message(error)}") from error
-        return DepthEstimator.untrained(spec, self.device)
+        return DepthEstimator.untrained(spec, self.device, **engine)
 
 
 class MatchingSettings(Settings):

@@ -6,8 +6,14 @@ from typing import Literal, Protocol
 import torch
 from torch import Tensor
 
+from cvcdepth_core.errors import EngineError
+
 Precision = Literal["float32", "bfloat16", "float16"]
 """In what an engine computes; depth is float32 always."""
+
+
+class DeviceMemoryError(EngineError):
+    """The device has too little memory for so many images at once."""
 
 
 class DisparityEngine(Protocol):
@@ -22,4 +28,7 @@ class DisparityEngine(Protocol):
         """Where it takes its images."""
 
     def disparity(self, images: Tensor) -> Tensor:
-        """Return the disparity [B, 1, H, W] in (0, 1) of `images` [B, 3, H, W] in [0, 1], float32 on `device`."""
+        """Return the disparity [B, 1, H, W] in (0, 1) of `images` [B, 3, H, W] in [0, 1], float32 on `device`.
+
+        Raises DeviceMemoryError, or torch's own error, when the device's memory is too small for B images.
+        """

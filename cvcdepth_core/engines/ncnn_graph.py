@@ -104,11 +104,7 @@ def _write_operation(writer: _Writer, graph: fx.GraphModule, node: fx.Node) -> N
 
 def _is_convolution(graph: fx.GraphModule, node: Any) -> bool:
     """Tell whether the node is a convolution that one layer reads."""
-    return (
-        node.op == "call_module"
-        and isinstance(graph.get_submodule(node.target), nn.Conv2d)
-        and len(node.users) == 1
-    )
+    return node.op == "call_module" and isinstance(graph.get_submodule(node.target), nn.Conv2d) and len(node.users) == 1
 
 
 def _layer(graph: fx.GraphModule, node: fx.Node) -> _Layer:
@@ -119,9 +115,9 @@ def _layer(graph: fx.GraphModule, node: fx.Node) -> _Layer:
                 return describe(module)
         raise EngineError(f"ncnn: layer {node.target} is a {type(module).__name__}, which is not known here")
     if node.target in _ARITHMETIC:
-        return _Layer("BinaryOp", {0: _ARITHMETIC[node.target], **_scalar(node.args[1])})  # type: ignore[index]
+        return _Layer("BinaryOp", {0: _ARITHMETIC[node.target], **_scalar(node.args[1])})
     if node.target in _FUNCTIONS:
-        return _FUNCTIONS[node.target](*node.args[1:], **node.kwargs)  # type: ignore[index, arg-type]
+        return _FUNCTIONS[node.target](*node.args[1:], **node.kwargs)
     raise EngineError(f"ncnn: operation {node.target} is not known here")
 
 

@@ -2,10 +2,10 @@
 """The depth network in a form that is quicker to run and gives the same depth.
 
 Batch normalisations are part of the convolutions before them. The decoder neither stretches its feature maps nor joins
-them with the encoder's: for a convolution over [stretched x, skip] is the sum of a convolution over skip and of one over
-stretched x, and the latter sees each pixel of x four times, so that a transposed convolution of x with sums of the same
-weights gives it with 4/9 of the work. Mirroring the stretched map at its border is repeating the border of x. An engine
-that convolves by Winograd's method multiplies still less over the stretched map.
+them with the encoder's: a convolution over [stretched x, skip] is the sum of one over skip and one over stretched x,
+and the latter sees each pixel of x four times, so that a transposed convolution of x with sums of the same weights
+gives it with 4/9 of the work. Mirroring the stretched map at its border is repeating the border of x. An engine that
+convolves by Winograd's method multiplies still less over the stretched map.
 
 What remains is written with plain modules and a few functions, which other engines' graphs are made from.
 """
@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from typing import cast
 
 import torch
 from torch import Tensor, fx, nn
@@ -60,7 +61,9 @@ class RewrittenDecoder(nn.Module):
         after = [_convolution(decoder, 2 * step + 1) for step in range(levels)]
         widths = [convolution.out_channels for convolution in before]
         self.before_upsampling = nn.ModuleList(nn.Sequential(mirrored(c), nn.ELU(inplace=True)) for c in before)
-        self.upsampling = nn.ModuleList(upsampled(_inputs(c, 0, n), transposed) for c, n in zip(after, widths, strict=True))
+        self.upsampling = nn.ModuleList(
+            upsampled(_inputs(c, 0, n), transposed) for c, n in zip(after, widths, strict=True)
+        )
         self.skips = nn.ModuleList(
             mirrored(_without_bias(_inputs(c, n, c.in_channels))) for c, n in zip(after[:-1], widths, strict=False)
         )
@@ -84,7 +87,7 @@ def fold_batch_norms(network: nn.Module) -> fx.GraphModule:
     for node in list(folded.graph.nodes):
         if node.op == "call_module" and isinstance(norm := folded.get_submodule(node.target), nn.BatchNorm2d):
             (convolution,) = node.args
-            fused = fuse_conv_bn_eval(folded.get_submodule(convolution.target), norm)
+            fused = fuse_conv_bn_eval(cast("nn.Conv2d", folded.get_submodule(convolution.target)), norm)
             folded.set_submodule(convolution.target, fused)
             node.replace_all_uses_with(convolution)
             folded.graph.erase_node(node)
@@ -112,12 +115,12 @@ def upsampled(convolution: nn.Conv2d, transposed: bool) -> nn.Sequential:
     """Return what stretches x [B, in, h, w] to twice its size and then convolves it as `mirrored` does."""
     if not transposed:
         return nn.Sequential(nn.Upsample(scale_factor=2), *mirrored(convolution))
-    transposed = nn.ConvTranspose2d(convolution.in_channels, convolution.out_channels, 4, stride=2, padding=3)
+    joined = nn.ConvTranspose2d(convolution.in_channels, convolution.out_channels, 4, stride=2, padding=3)
     taps = torch.tensor(_MEETING_TAPS, dtype=torch.float64)
     weight = torch.einsum("ai,bj,ocij->coab", taps, taps, convolution.weight.double())
-    transposed.weight = nn.Parameter(weight.to(convolution.weight.dtype), requires_grad=False)
-    transposed.bias = convolution.bias
-    return nn.Sequential(nn.ReplicationPad2d(1), transposed)
+    joined.weight = nn.Parameter(weight.to(convolution.weight.dtype), requires_grad=False)
+    joined.bias = convolution.bias
+    return nn.Sequential(nn.ReplicationPad2d(1), joined)
 
 
 def _convolution(decoder: DepthDecoder, index: int) -> nn.Conv2d:

@@ -37,7 +37,7 @@ class TorchEngine:
         self.name = f"{'torch_compiled' if compiled else 'torch'} {torch.__version__} {precision}"
         self.device = device
         rewritten = MixedPrecision(RewrittenDepthNet(network), getattr(torch, precision))
-        self._network: nn.Module = rewritten.to(device, memory_format=torch.channels_last)
+        self._network: nn.Module = rewritten.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         if compiled:
             self._network = torch.compile(self._network, mode="reduce-overhead", dynamic=False)  # type: ignore[assignment]
 

@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ONNX: export of the rewritten network, and ONNX Runtime on CPU, CUDA and TensorRT."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import io
+import os
+import warnings
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from cvcdepth_core.checkpoint import DepthModelSpec
+from cvcdepth_core.engines.engine import DeviceMemoryError, Precision
+from cvcdepth_core.engines.rewriting import RewrittenDepthNet
+from cvcdepth_core.errors import EngineError
+from cvcdepth_core.networks import DepthNet
+
+INPUT, OUTPUT = "images", "disparity"
+MOST_CAMERAS = 12
+"""Images that a TensorRT engine takes at once."""
+
+_OPSET = 17
+_USUAL_CAMERAS = 6
+
+
+def onnx_model(network: DepthNet, spec: DepthModelSpec) -> bytes:
+    """Return an ONNX model: `images` [B, 3, H, W] in [0, 1] to `disparity` [B, 1, H, W], H and W those of `spec`."""
+    example = torch.zeros(1, 3, spec.height, spec.width)
+    content = io.BytesIO()
+    # The newer exporter needs two more packages and gives the same graph; torch before 2.5 does not know the word.
+    older = {"dynamo": False} if "dynamo" in inspect.signature(torch.onnx.export).parameters else {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            RewrittenDepthNet(network).float().cpu(),
+            (example,),
+            content,  # type: ignore[arg-type]
+            opset_version=_OPSET,
+            input_names=[INPUT],
+            output_names=[OUTPUT],
+            dynamic_axes={INPUT: {0: "cameras"}, OUTPUT: {0: "cameras"}},
+            **older,  # type: ignore[arg-type]
+        )
+    return content.getvalue()
+
+
+class OnnxRuntimeEngine:
+    """The exported network in ONNX Runtime; on a CPU on as many threads as torch has when it is built."""
+
+    def __init__(self, network: DepthNet, spec: DepthModelSpec, device: torch.device) -> None:
+        """EngineError when this ONNX Runtime cannot use `device`."""
+        import onnxruntime
+
+        provider = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}[device.type]
+        options = {"device_id": device.index or 0} if device.type == "cuda" else {}
+        self.device = device
+        self.name = f"onnxruntime {onnxruntime.__version__} {device.type} float32"
+        self._session = _session(onnx_model(network, spec), [(provider, options)])
+
+    def disparity(self, images: Tensor) -> Tensor:
+        """See `DisparityEngine`."""
+        return _run(self._session, images)
+
+
+class TensorRtEngine:
+    """The exported network in ONNX Runtime's TensorRT provider, from an engine that was built before."""
+
+    def __init__(
+        self,
+        network: DepthNet,
+        spec: DepthModelSpec,
+        device: torch.device,
+        precision: Precision,
+        cache: Path | None = None,
+        build: bool = False,
+    ) -> None:
+        """EngineError when the engine was not built (`build` does it, which takes minutes)."""
+        import onnxruntime
+
+        self.device = device
+        self.name = f"tensorrt of onnxruntime {onnxruntime.__version__} {precision}"
+        folder = engine_folder(network, spec, device, precision, cache)
+        if not build and not any(folder.glob("*.engine")):
+            raise EngineError(
+                f"{self.name}: no engine of this network for {torch.cuda.get_device_name(device)} in {folder}; "
+                "build it, which takes minutes, with: cvcdepth export --tensorrt"
+            )
+        folder.mkdir(parents=True, exist_ok=True)
+        options = _tensorrt_options(spec, device, precision, folder)
+        self._session = _session(onnx_model(network, spec), [("TensorrtExecutionProvider", options)])
+
+    def disparity(self, images: Tensor) -> Tensor:
+        """See `DisparityEngine`."""
+        return torch.cat([_run(self._session, chunk) for chunk in images.split(MOST_CAMERAS)])  # type: ignore[no-untyped-call]
+
+
+def engine_folder(
+    network: DepthNet, spec: DepthModelSpec, device: torch.device, precision: Precision, cache: Path | None = None
+) -> Path:
+    """Name the folder of a built TensorRT engine, by GPU, versions, weights, size and precision."""
+    import onnxruntime
+
+    root = cache or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "cvcdepth" / "tensorrt"
+    gpu = torch.cuda.get_device_name(device).replace(" ", "-")
+    capability = ".".join(map(str, torch.cuda.get_device_capability(device)))
+    versions = f"onnxruntime-{onnxruntime.__version__}_cuda-{torch.version.cuda}"
+    weights = f"{spec.encoder}-{spec.height}x{spec.width}-{weights_hash(network)[:16]}"
+    return root / f"{gpu}_{capability}_{versions}" / f"{weights}_{precision}"
+
+
+def weights_hash(network: DepthNet) -> str:
+    """Return the SHA-256 of all names and values of the network's state."""
+    digest = hashlib.sha256()
+    for name, value in network.state_dict().items():
+        digest.update(name.encode())
+        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
+
+def _tensorrt_options(spec: DepthModelSpec, device: torch.device, precision: Precision, folder: Path) -> dict[str, Any]:
+    shapes = {"min": 1, "opt": _USUAL_CAMERAS, "max": MOST_CAMERAS}
+    return {
+        "device_id": device.index or 0,
+        "trt_fp16_enable": precision == "float16",
+        "trt_bf16_enable": precision == "bfloat16",
+        "trt_engine_cache_enable": True,
+        "trt_engine_cache_path": str(folder),
+        "trt_timing_cache_enable": True,
+        "trt_timing_cache_path": str(folder),
+        **{f"trt_profile_{key}_shapes": f"{INPUT}:{n}x3x{spec.height}x{spec.width}" for key, n in shapes.items()},
+    }
+
+
+def _session(model: bytes, providers: list[tuple[str, dict[str, Any]]]) -> Any:
+    import onnxruntime
+
+    wanted = providers[0][0]
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = torch.get_num_threads()
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # other threads need the cores
+    try:
+        session = onnxruntime.InferenceSession(model, options, providers=providers)
+    except Exception as error:  # its exceptions have no common base
+        raise EngineError(f"onnxruntime {onnxruntime.__version__}: {wanted}: {error}") from error
+    if wanted not in session.get_providers():  # it falls back to the CPU with a mere warning
+        raise EngineError(
+            f"onnxruntime {onnxruntime.__version__}: {wanted} is not available, found {session.get_providers()}"
+        )
+    return session
+
+
+def _run(session: Any, images: Tensor) -> Tensor:
+    try:
+        (disparity,) = session.run([OUTPUT], {INPUT: images.cpu().numpy()})
+    except Exception as error:
+        if "memory" in str(error).lower() or "alloc" in str(error).lower():
+            raise DeviceMemoryError(str(error)) from error
+        raise EngineError(f"onnxruntime: inference failed: {error}") from error
+    return torch.from_numpy(disparity).to(images.device)

@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which engine runs the network: the one that was asked for, or the best that is there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib.util import find_spec
+from typing import Literal, get_args
+
+import torch
+
+from cvcdepth_core.checkpoint import DepthModelSpec
+from cvcdepth_core.engines.chunks import ChunkedEngine
+from cvcdepth_core.engines.engine import DisparityEngine, Precision
+from cvcdepth_core.engines.parity import check_parity
+from cvcdepth_core.engines.torch_engine import TorchEagerEngine, TorchEngine
+from cvcdepth_core.errors import ConfigError, EngineError
+from cvcdepth_core.networks import DepthNet
+
+Backend = Literal["auto", "ncnn", "torch", "torch_eager", "torch_compiled", "onnxruntime", "tensorrt"]
+
+BACKENDS: tuple[str, ...] = get_args(Backend)
+
+_PACKAGES = {"ncnn": "ncnn", "onnxruntime": "onnxruntime", "tensorrt": "onnxruntime"}
+_CPU_ONLY, _CUDA_ONLY = ("ncnn",), ("torch_compiled", "tensorrt")
+_HALF_PRECISION = ("torch", "torch_compiled", "tensorrt")
+
+
+def build_engine(
+    network: DepthNet,
+    spec: DepthModelSpec,
+    device: str = "auto",
+    backend: str = "auto",
+    precision: Precision = "float32",
+    cpu_without_memory: bool = False,
+) -> ChunkedEngine:
+    """Make the network ready to run, and check that its depth is still the network's.
+
+    `device` auto is CUDA where there is one and the backend can use it. `backend` auto is, on a CPU, ncnn where it is
+    installed, else torch. With `cpu_without_memory`, a GPU that is out of memory is replaced by the CPU.
+    Raises ConfigError when the three do not go together, EngineError when the engine is not installed or gives another
+    depth.
+    """
+    place = _place(device, backend)
+    chosen = _choose(backend, place)
+    _refuse_impossible(chosen, place, precision)
+    _refuse_missing(chosen)
+    engine = _build(chosen, network, spec, place, precision)
+    if chosen != "torch_eager":
+        check_parity(engine, network, spec, precision)
+    fallback = _on_cpu(network, spec) if cpu_without_memory and place.type == "cuda" else None
+    return ChunkedEngine(engine, fallback)
+
+
+def resolve_device(name: str) -> torch.device:
+    """Return the device of that name, `auto` being CUDA where there is one; ConfigError when it is not there."""
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise ConfigError(f"device: '{name}' is not available: {str(error).splitlines()[0]}") from error
+    return device
+
+
+def is_installed(backend: str) -> bool:
+    """Tell whether the package behind a backend can be imported."""
+    return backend not in _PACKAGES or find_spec(_PACKAGES[backend]) is not None
+
+
+def _place(device: str, backend: str) -> torch.device:
+    return torch.device("cpu") if device == "auto" and backend in _CPU_ONLY else resolve_device(device)
+
+
+def _choose(backend: str, device: torch.device) -> str:
+    if backend != "auto":
+        return backend
+    return "ncnn" if device.type == "cpu" and is_installed("ncnn") else "torch"
+
+
+def _refuse_impossible(backend: str, device: torch.device, precision: Precision) -> None:
+    if backend not in BACKENDS:
+        raise ConfigError(f"backend is '{backend}', expected one of {', '.join(BACKENDS)}")
+    needs = {"cpu": backend in _CPU_ONLY, "cuda": backend in _CUDA_ONLY}
+    for place, needed in needs.items():
+        if needed and device.type != place:
+            raise ConfigError(f"backend {backend} runs on {place} only, the device is '{device}'")
+    if precision != "float32" and not (device.type == "cuda" and backend in _HALF_PRECISION):
+        raise ConfigError(
+            f"precision {precision} needs a CUDA device and one of {', '.join(_HALF_PRECISION)}, "
+            f"found backend {backend} on '{device}'"
+        )
+
+
+def _refuse_missing(backend: str) -> None:
+    if not is_installed(backend):
+        package = _PACKAGES[backend]
+        raise EngineError(f"backend {backend}: package {package} is not installed; pip install 'cvcdepth_ros[onnx]'")
+
+
+def _build(
+    backend: str, network: DepthNet, spec: DepthModelSpec, device: torch.device, precision: Precision
+) -> DisparityEngine:
+    if backend == "torch_eager":
+        return TorchEagerEngine(network, device)
+    if backend == "ncnn":
+        from cvcdepth_core.engines.ncnn_engine import NcnnEngine
+
+        return NcnnEngine(network)
+    if backend in ("onnxruntime", "tensorrt"):
+        from cvcdepth_core.engines.onnx_engine import OnnxRuntimeEngine, TensorRtEngine
+
+        if backend == "tensorrt":
+            return TensorRtEngine(network, spec, device, precision)
+        return OnnxRuntimeEngine(network, spec, device)
+    return TorchEngine(network, device, precision, compiled=backend == "torch_compiled")
+
+
+def _on_cpu(network: DepthNet, spec: DepthModelSpec) -> Callable[[], DisparityEngine]:
+    return lambda: build_engine(network, spec, "cpu")
