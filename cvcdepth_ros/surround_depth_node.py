@@ -12,7 +12,6 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
-from rclpy.executors import ExternalShutdownException
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.utilities import remove_ros_args
@@ -202,6 +201,9 @@ def main(args: Sequence[str] | None = None) -> None:
     arguments = list(sys.argv if args is None else args)
     _parse_command_line(remove_ros_args(arguments)[1:])
     prepare_process()
+    # rclpy ends the spinning on SIGINT as on SIGTERM. A KeyboardInterrupt besides would come in the middle of anything:
+    # while a message is taken, rclpy's extension makes a RuntimeError of it.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     rclpy.init(args=arguments)
     try:
         node = SurroundDepthNode()
@@ -210,8 +212,10 @@ def main(args: Sequence[str] | None = None) -> None:
     try:
         node.autostart()
         rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
+    except Exception:
+        # A signal invalidates the context at once, and so whatever a callback has just asked rclpy for.
+        if rclpy.ok():
+            raise
     _end(node)
 
 

@@ -116,7 +116,7 @@ def record(output: Path, topics: Mapping[str, str], watched: str, idle_seconds: 
         try:
             while rclpy.ok() and time.monotonic() - recorder.last_message < idle_seconds:
                 executor.spin_once(timeout_sec=_SPIN_SECONDS)
-        except (KeyboardInterrupt, ExternalShutdownException):
+        except ExternalShutdownException:
             pass
         # A second signal must not cut the file.
         for number in (signal.SIGINT, signal.SIGTERM):
@@ -129,6 +129,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the recorder; return the exit code."""
     options = _parse(arguments)
     prepare_process()
+    # rclpy ends the spinning; a KeyboardInterrupt besides could come while rclpy's extension takes a message.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     rclpy.init(args=[])
     try:
         summary = record(options.output, dict(options.topic), options.node, options.idle_seconds)
