@@ -2,9 +2,14 @@
 """Real nodes over real DDS for the tests: the node as a process of its own, publishers and subscribers beside it.
 
 Knows nothing of the package's code but the node's module name and its topics.
+
+Importing torch takes more processor time than most tests of the node, so their processes are forked from one that has
+imported the node and done nothing else. test_demo.py and others start it as users do.
 """
 
+import importlib
 import itertools
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -25,6 +30,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
+NODE_MODULE = "cvcdepth_ros.surround_depth_node"
 PROFILE = Path(__file__).parents[2] / "config" / "fastdds_large_shm.xml"
 TIMEOUT = 60.0
 
@@ -38,6 +44,49 @@ def reliable(depth: int = 100, latched: bool = False) -> QoSProfile:
 
 def best_effort(depth: int = 10) -> QoSProfile:
     return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+class NodeProcess:
+    """A running surround_depth_node, used like a subprocess.Popen."""
+
+    _forks = multiprocessing.get_context("forkserver")
+    _forks.set_forkserver_preload([NODE_MODULE])
+
+    def __init__(self, arguments: Sequence[str], environment: dict[str, str], log: Path) -> None:
+        self._process = self._forks.Process(target=_run_node, args=(arguments, environment, log))
+        self._process.start()
+
+    @property
+    def pid(self) -> int:
+        assert self._process.pid is not None
+        return self._process.pid
+
+    def poll(self) -> int | None:
+        """Return the exit code, negative for a signal; None while it runs."""
+        return self._process.exitcode
+
+    def wait(self, seconds: float | None = None) -> int:
+        """Return the exit code; subprocess.TimeoutExpired when it has not ended by then."""
+        self._process.join(seconds)
+        if self._process.exitcode is None:
+            raise subprocess.TimeoutExpired(NODE_MODULE, seconds or 0.0)
+        return self._process.exitcode
+
+    def send_signal(self, number: int) -> None:
+        os.kill(self.pid, number)
+
+    def kill(self) -> None:
+        self._process.kill()
+
+
+def _run_node(arguments: Sequence[str], environment: dict[str, str], log: Path) -> None:
+    """Be `python -m cvcdepth_ros.surround_depth_node`."""
+    os.environ.update(environment)
+    with log.open("wb") as output:
+        for stream in (sys.stdout, sys.stderr):
+            stream.flush()
+            os.dup2(output.fileno(), stream.fileno())
+    importlib.import_module(NODE_MODULE).main([NODE_MODULE, *arguments])
 
 
 class RosGraph:
@@ -55,24 +104,19 @@ class RosGraph:
         self._executor.add_node(self.node)
         self.received: dict[str, list[Any]] = defaultdict(list)
         self.statuses: dict[str, Any] = {}
-        self._processes: list[tuple[subprocess.Popen[bytes], Path]] = []
+        self._processes: list[tuple[NodeProcess, Path]] = []
         self._folder = Path(self._resources.enter_context(tempfile.TemporaryDirectory()))
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
 
-    def start_node(self, *arguments: str, **parameters: Any) -> "subprocess.Popen[bytes]":
+    def start_node(self, *arguments: str, **parameters: Any) -> NodeProcess:
         """Start surround_depth_node with these parameters."""
         pairs = [
             f"{name}:={str(value).lower() if isinstance(value, bool) else value}" for name, value in parameters.items()
         ]
-        options = list(itertools.chain.from_iterable(("-p", pair) for pair in pairs))
+        options = itertools.chain.from_iterable(("-p", pair) for pair in pairs)
         log = self._folder / f"{len(self._processes)}.log"
-        with log.open("wb") as output:
-            process = subprocess.Popen(
-                [sys.executable, "-m", "cvcdepth_ros.surround_depth_node", "--ros-args", *options, *arguments],
-                env=os.environ | {"ROS_DOMAIN_ID": str(self.domain)},
-                stdout=output,
-                stderr=subprocess.STDOUT,
-            )
+        environment = os.environ | {"ROS_DOMAIN_ID": str(self.domain)}
+        process = NodeProcess(["--ros-args", *options, *arguments], environment, log)
         self._processes.append((process, log))
         return process
 

@@ -2,7 +2,6 @@
 """The node as its users meet it: a process that is fed and read over DDS."""
 
 import signal
-import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -400,11 +399,7 @@ def test_a_signal_ends_the_node_also_in_the_middle_of_inference(number, graph, m
     graph.await_subscribers([f"/camera/{name}/image_raw/compressed" for name in CAMERAS])
     feed.publish_until(lambda: int(graph.values("synchronisation").get("delivered", 0)), "a set in the worker")
     process.send_signal(number)
-    try:
-        code = process.wait(10)
-    except subprocess.TimeoutExpired:
-        pytest.fail("the node did not end")
-    assert code == 0
+    assert process.wait(60) == 0, graph.log()
     assert "Traceback" not in graph.log()
 
 
@@ -418,7 +413,7 @@ def test_old_sets_are_dropped_and_counted_when_ros_time_has_moved_on(graph, mess
 
 
 def test_full_size_raw_images_at_ten_hertz_are_not_lost(graph, messages, rig_content, tmp_path):
-    size, sets = (1080, 1920), 20
+    size, sets = (1080, 1920), 10
     infos, images, publishers = {}, {}, {}
     for camera in rig_content["cameras"]:
         name = camera["name"]
@@ -433,9 +428,10 @@ def test_full_size_raw_images_at_ten_hertz_are_not_lost(graph, messages, rig_con
         images[name].data.frombytes(np.full((*size, 3), 90, np.uint8).tobytes())
         publishers[name] = (
             graph.node.create_publisher(CameraInfo, camera["camera_info_topic"], reliable()),
-            graph.node.create_publisher(Image, camera["image_topic"], reliable(10)),
+            graph.node.create_publisher(Image, camera["image_topic"], reliable(sets)),
         )
-    # Best effort loses nothing either on a quiet machine; a test must not depend on what else runs.
+    # Best effort, or a publisher that keeps fewer images, loses nothing on a quiet machine either; a test must not
+    # depend on what else runs.
     graph.start_node(rig=write_rig(tmp_path, rig_content), reliable=True, **SMALL)
     graph.subscribe(Image, "/surround_depth/front/depth/image_rect")
     graph.await_subscribers([f"/camera/{name}/image_raw" for name in CAMERAS])
@@ -450,7 +446,7 @@ def test_full_size_raw_images_at_ten_hertz_are_not_lost(graph, messages, rig_con
             publishers[name][1].publish(images[name])
             graph.spin(max(0.0, start + index * 0.1 + (offset + 1) * 0.016 - time.monotonic()))
     graph.spin_until(
-        lambda: all(graph.values(f"camera {name}").get("received") == str(sets) for name in CAMERAS), "every image", 20
+        lambda: all(graph.values(f"camera {name}").get("received") == str(sets) for name in CAMERAS), "every image"
     )
     age = "age of newest image at publish (ROS time) p50 (ms)"
     graph.spin_until(lambda: age in graph.values("inference"), "a published set")
