@@ -13,6 +13,9 @@ DEV := .venv/installed/dev-$(call key,dev)
 CORE := .venv-core/installed/core_test-$(call key,core_test)
 TF2 := .venv/installed/tf2_msgs-$(shell cat tests/tf2_msgs/*.* tests/tf2_msgs/msg/* | sha256sum | cut -c1-12)
 
+# Two tests at a time. A file's tests mostly stay in one process, which has the results that they share.
+BESIDE := -n 2 --dist worksteal
+
 BENCHMARKS := $(filter-out measuring table,$(basename $(notdir $(wildcard benchmarks/*.py))))
 
 # A sourced ROS 2 installation must not leak into the wheels' environment, and nothing here talks to other machines.
@@ -44,11 +47,11 @@ lint: $(DEV) ## ruff and mypy
 	.venv/bin/mypy
 
 test-ros: $(DEV) tf2_msgs ## the tests in tests/ros, with ROS 2 from wheels
-	.venv/bin/python -m pytest tests/ros
+	.venv/bin/python -m pytest $(BESIDE) tests/ros
 
 test-core: $(CORE) ## all other tests, in an environment without ROS
 	@if .venv-core/bin/python -c 'import rclpy' 2>/dev/null; then echo "rclpy is in .venv-core: make clean"; exit 1; fi
-	.venv-core/bin/python -m pytest --ignore tests/ros
+	.venv-core/bin/python -m pytest $(BESIDE) --ignore tests/ros
 
 tf2_msgs: $(DEV) ## build tf2_msgs, which has no wheel, for the tests of /tf_static (needs g++)
 	@test -e $(TF2) || .venv/bin/python tests/tf2_msgs/build.py $(TF2)
