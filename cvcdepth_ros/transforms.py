@@ -16,6 +16,8 @@ from cvcdepth_core.poses import Pose, check_rigid, inverse, pose_from_quaternion
 
 # Below this angle (radians) between two rotations a straight line between their quaternions is exact in float64.
 _SMALL_ANGLE = 1e-6
+# Keyframes at 2 Hz pass, with jitter. A car in a bend (15 m/s, 0.3 rad/s) is then 0.2 m off the line between two poses.
+_LONGEST_GAP = 0.6
 
 
 def frame_name(frame_id: str) -> str:
@@ -92,8 +94,10 @@ class TransformTree:
 class PoseTrack:
     """One moving link (odom to base_link, say) over time."""
 
-    def __init__(self, parent: str, child: str) -> None:
+    def __init__(self, parent: str, child: str, longest_gap: float = _LONGEST_GAP) -> None:
+        """Between poses that are more than `longest_gap` seconds apart nothing is interpolated."""
         self.parent, self.child = frame_name(parent), frame_name(child)
+        self._longest_gap = longest_gap
         self._stamps: list[int] = []
         self._poses: list[Pose] = []
 
@@ -126,7 +130,7 @@ class PoseTrack:
     def lookup(self, stamp: int) -> Pose:
         """Return parent_T_child [4, 4] at a stamp (ns): translation interpolated linearly, rotation by slerp.
 
-        Raises TransformError outside of the span: nothing is extrapolated.
+        Raises TransformError outside of the span, for nothing is extrapolated, and in a gap.
         """
         first, last = self.span
         if not first <= stamp <= last:
@@ -136,8 +140,13 @@ class PoseTrack:
         index = bisect_left(self._stamps, stamp)
         if self._stamps[index] == stamp:
             return np.array(self._poses[index])
-        before = self._stamps[index - 1]
-        fraction = (stamp - before) / (self._stamps[index] - before)
+        before, after = self._stamps[index - 1], self._stamps[index]
+        if after - before > self._longest_gap * 1e9:
+            raise TransformError(
+                f"no transform {self.parent} <- {self.child} at {stamp} ns: it is known at {before} and {after} ns, "
+                f"{(after - before) / 1e9:.3f} s apart, more than {self._longest_gap:g} s"
+            )
+        fraction = (stamp - before) / (after - before)
         return _interpolated(self._poses[index - 1], self._poses[index], fraction)
 
     def forget_before(self, stamp: int) -> None:

@@ -205,6 +205,17 @@ def test_nothing_is_extrapolated(stamp: int):
         track.lookup(stamp)
 
 
+def test_nothing_is_interpolated_over_a_long_gap():
+    track = PoseTrack("odom", "base_link", longest_gap=0.5)
+    for tenths in (0, 5, 11):
+        track.add(tenths * 10**8, turned(0, x=tenths))
+    assert track.lookup(4 * 10**8)[0, 3] == pytest.approx(4)
+    assert track.lookup(11 * 10**8)[0, 3] == 11
+    between = r"at 800000000 ns: it is known at 500000000 and 1100000000 ns, 0\.600 s apart, more than 0\.5 s"
+    with pytest.raises(TransformError, match=between):
+        track.lookup(8 * 10**8)
+
+
 def test_a_track_without_poses_says_so():
     with pytest.raises(TransformError, match="no transform odom <- base_link at any time"):
         PoseTrack("odom", "base_link").lookup(5)
