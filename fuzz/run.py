@@ -36,7 +36,7 @@ def main() -> None:
         f"-max_total_time={arguments.seconds}",
         f"-max_len={arguments.max_len}",
         f"-artifact_prefix={HERE / 'findings'}/{arguments.target}_",
-        "-timeout=20",
+        "-timeout=600",
         f"-rss_limit_mb={2 * _MEBIBYTES}",
         "-print_final_stats=1",
         "-seed=1",

@@ -11,6 +11,8 @@ from cvcdepth_core.errors import RecordingError
 from cvcdepth_ros.bags.topics import RecordedMessage, RecordingFile, Topic, joined_topics, recorded_qos
 
 MAGIC = b"SQLite format 3\0"
+# What sqlite3 raises on damaged bytes, also where it reports an error whose text is not UTF-8.
+_DAMAGE = (sqlite3.Error, UnicodeDecodeError, OverflowError)
 _TABLES = ("topics", "messages", "message_definitions")
 
 
@@ -30,7 +32,7 @@ class SqliteFile(RecordingFile):
                 self.start, self.end = database.execute(
                     "SELECT MIN(timestamp), MAX(timestamp) FROM messages"
                 ).fetchone()
-        except sqlite3.Error as error:
+        except _DAMAGE as error:
             raise RecordingError(f"{path}: not readable as a rosbag2 database: {error}") from error
         if not isinstance(self.start, int | None) or not isinstance(self.end, int | None):
             raise RecordingError(f"{path}: timestamps from {self.start!r:.40} to {self.end!r:.40} are not integers")
@@ -51,7 +53,7 @@ class SqliteFile(RecordingFile):
                         count += 1
                     else:
                         self._report(f"{wanted[id_]}: a row with no integer as time or no bytes as message was skipped")
-            except sqlite3.DatabaseError as error:
+            except _DAMAGE as error:
                 self._report(f"reading stopped after {count} messages", error)
 
     def _connect(self) -> sqlite3.Connection:
