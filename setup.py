@@ -34,7 +34,7 @@ setup(
     maintainer_email="maintainers@cvcdepth.invalid",
     python_requires=">=3.10",
     packages=find_packages(include=["cvcdepth_core*", "cvcdepth_ros*"]),
-    package_data={"cvcdepth_core": ["py.typed"], "cvcdepth_ros": ["py.typed", *TEMPLATES]},
+    package_data={"cvcdepth_core": ["py.typed", "models/*"], "cvcdepth_ros": ["py.typed", *TEMPLATES]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (str(SHARE), ["package.xml"]),
@@ -44,9 +44,9 @@ setup(
     install_requires=["torch>=2.3", *requirements("core")],
     extras_require={
         "ros-jazzy": requirements("ros"),
-        **{name: requirements(name) for name in ("s3", "report", "fleet", "tensorboard")},
+        **{name: requirements(name) for name in ("s3", "report", "fleet", "tensorboard", "onnx")},
     },
-    zip_safe=True,
+    zip_safe=False,
     entry_points={
         "console_scripts": [
             "surround_depth_node = cvcdepth_ros.surround_depth_node:main",

@@ -42,10 +42,10 @@ class NodeParameters(OutputSettings, MissingCameraSettings, MatchingSettings, Mo
         """Raise ConfigError where the parameters are each possible but together not enough to start with."""
         if not self.rig:
             raise ConfigError(f"parameter rig is empty: name a rig file, or '{AUTO}'")
-        if self.untrained == bool(self.checkpoint):
+        if self.untrained and self.checkpoint:
             raise ConfigError(
-                f"parameters checkpoint '{self.checkpoint}' and untrained {self.untrained}: name a checkpoint file, or"
-                " set untrained to run random weights, whose depth means nothing"
+                f"parameters checkpoint '{self.checkpoint}' and untrained true: a checkpoint is trained; name none "
+                "to run random weights"
             )
 
 

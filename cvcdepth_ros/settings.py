@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from cvcdepth_core.calibration import first_validation_message
+from cvcdepth_core.default_model import DEFAULT, NOTICE, checkpoint_path
 from cvcdepth_core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -30,11 +31,11 @@ class ModelSettings(Settings):
     """Which network estimates depth, and where it runs."""
 
     checkpoint: str = ""
-    """Checkpoint file (safetensors) of the depth network."""
+    """Checkpoint file (safetensors) of the depth network; without one, or 'default', the package's own small model."""
     untrained: bool = False
     """Run a network with random weights instead of a checkpoint. Its depth has the right form and no meaning."""
     encoder: str = "resnet18"
-    """Untrained network only: resnet18 or resnet34. A checkpoint names its own."""
+    """Untrained network only: resnet18, resnet34 or efficientnet_lite0. A checkpoint names its own."""
     height: int = Field(384, ge=32, le=4096, multiple_of=32)
     """Untrained network only: rows of its input. A checkpoint names its own."""
     width: int = Field(640, ge=32, le=4096, multiple_of=32)
@@ -48,14 +49,27 @@ class ModelSettings(Settings):
     cpu_without_memory: bool = False
     """Go on with the CPU, more slowly, when the GPU's memory is too small even for one camera."""
 
+    @property
+    def checkpoint_path(self) -> Path | None:
+        """The checkpoint's file; None for a network with random weights."""
+        return None if self.untrained else checkpoint_path(self.checkpoint)
+
+    @property
+    def notice(self) -> str:
+        """What must be said of the network's depth; nothing about a checkpoint of the user's own."""
+        if self.untrained:
+            return "untrained: the network has random weights, and its depth means nothing"
+        return NOTICE if self.checkpoint in ("", DEFAULT) else ""
+
     def build_estimator(self) -> "DepthEstimator":
         """Load the checkpoint, or make the untrained network; CheckpointError or ConfigError says what is wrong."""
         from cvcdepth_core.checkpoint import DepthModelSpec
         from cvcdepth_core.estimator import DepthEstimator
 
         engine = self.model_dump(include={"backend", "precision", "cpu_without_memory"})
-        if not self.untrained:
-            return DepthEstimator.from_checkpoint(Path(self.checkpoint).expanduser(), self.device, **engine)
+        path = self.checkpoint_path
+        if path is not None:
+            return DepthEstimator.from_checkpoint(path, self.device, **engine)
         try:
             spec = DepthModelSpec(
                 encoder=self.encoder, height=self.height, width=self.width, min_depth=1.5, max_depth=200.0

@@ -81,8 +81,8 @@ class SurroundDepthNode(LifecycleNode):  # type: ignore[misc] # rclpy is not ann
             return self._fail(str(error))
         self._settings, self._failure = parameters, ""
         self.get_logger().info(f"model: {self._estimator.model_id} on {self._estimator.device}")
-        if parameters.untrained:
-            self.get_logger().warning("untrained: the network has random weights and its depth means nothing")
+        if parameters.notice:
+            self.get_logger().warning(parameters.notice)
         return TransitionCallbackReturn.SUCCESS
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:

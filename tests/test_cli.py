@@ -71,7 +71,7 @@ def test_help_and_version_load_neither_torch_nor_ros():
         "",
         "fly drive.mcap",
         "rig",
-        "run drive.mcap -o depth",
+        "run drive.mcap -o depth --width 640",
         "run drive.mcap -o depth --untrained --checkpoint w.safetensors",
         "run drive.mcap -o depth --untrained --tolerance -1",
         "run drive.mcap -o depth --untrained --height 65",

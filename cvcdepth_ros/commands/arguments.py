@@ -74,9 +74,9 @@ def add_settings(
 ) -> "argparse._MutuallyExclusiveGroup":
     """Declare an option for every field of a settings model; what is not given keeps the model's default.
 
-    Options of `repeatable` fields give lists. Returns the group of those options of which one must be given.
+    Options of `repeatable` fields give lists. Returns the group of those options of which at most one is given.
     """
-    network = parser.add_mutually_exclusive_group(required=True)
+    network = parser.add_mutually_exclusive_group()
     for name, field in settings.model_fields.items():
         group = network if name in ("checkpoint", "untrained", "predictor") else parser
         shown = "" if field.default in ("", None) or field.default is False else f" [{field.default}]"
@@ -90,7 +90,7 @@ def settings_from(arguments: argparse.Namespace, settings: type[SettingsT]) -> S
     """Build the settings that `add_settings` declared; a value out of range ends the program as wrong use."""
     given = {name: value for name, value in vars(arguments).items() if name in settings.model_fields}
     untrained_only = sorted(given.keys() & {"encoder", "height", "width"})
-    if "checkpoint" in given and untrained_only:
+    if untrained_only and not given.keys() & {"untrained", "predictor"}:
         arguments.usage_error(f"--{', --'.join(untrained_only)}: for --untrained only, a checkpoint names its own")
     try:
         return settings.model_validate(given)

@@ -132,8 +132,8 @@ def _evaluated(
     """Write one model's results; return their folder and what to print."""
     from cvcdepth_ros.evaluation.frames import write_csv
 
-    if settings.untrained:
-        warn("untrained: the network has random weights, and its depth means nothing")
+    if settings.notice:
+        warn(settings.notice)
     with_report = not arguments.no_report and _is_drawable()
     jobs = _jobs(arguments, settings)
     result = _result(arguments, settings, jobs, folder)

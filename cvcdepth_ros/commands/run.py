@@ -40,7 +40,7 @@ The same matching, preprocessing and network as the live node, without DDS and a
 computed. OUT becomes a rosbag2 folder (mcap) with depth images, camera_info, rectified pictures, the merged cloud and
 the transforms, on the node's topic names; OUT/run.json tells what was done with what."""
 EXAMPLES: tuple[str, ...] = (
-    "run drive.mcap -o depth --checkpoint model.safetensors",
+    "run drive.mcap -o depth",
     "run drive/ -o depth --checkpoint model.safetensors --rig rig.yaml --start 10 --duration 5 --clouds all",
     "run drive/ -o try_out --untrained --height 96 --width 160",
 )
@@ -77,8 +77,8 @@ def execute(arguments: argparse.Namespace) -> None:
     settings = settings_from(arguments, RunSettings)
     from cvcdepth_ros.bags import open_recording
 
-    if settings.untrained:
-        warn("untrained: the network has random weights, and its depth means nothing")
+    if settings.notice:
+        warn(settings.notice)
     with open_recording(arguments.recording) as recording:
         from cvcdepth_ros.replay import DepthReplay, SurroundReplay  # torch: not before there is a recording
 

@@ -27,7 +27,7 @@ from cvcdepth_ros.demo.paths import DemoPaths
 from cvcdepth_ros.demo.processes import children
 from cvcdepth_ros.demo.received import Output, ReceivedSets, node_outputs, sent_sets
 from cvcdepth_ros.demo.recorded_lidar import RecordedLidar
-from cvcdepth_ros.demo.result import UNTRAINED_WARNING, DemoResult
+from cvcdepth_ros.demo.result import DemoResult
 from cvcdepth_ros.demo.sheets import SheetWriter
 from cvcdepth_ros.settings import ModelSettings
 from cvcdepth_ros.version import package_version
@@ -64,8 +64,8 @@ def run(options: argparse.Namespace) -> DemoResult:
     model = _model(options)
     paths = DemoPaths(options.output)
     paths.prepare()
-    if model.untrained:
-        print(f"{UNTRAINED_WARNING}. No checkpoint was given: its weights are random.")
+    if model.notice:
+        print(model.notice)
     with children(paths.logs) as family:
         live = LiveRun(family, paths, NODE)
         live.write_rig(options.recording)
@@ -76,8 +76,8 @@ def run(options: argparse.Namespace) -> DemoResult:
         outcome = live.play(setup.recording, rate, options.duration, setup.outputs)
     result = _show(setup, paths, outcome)
     print(f"\n{result.text()}\n\npictures  {paths.sheets}\npage      {paths.page}\nresult    {paths.result}")
-    if result.untrained:
-        print(UNTRAINED_WARNING)
+    if model.notice:
+        print(model.notice)
     return result
 
 
@@ -126,6 +126,8 @@ def _model(options: argparse.Namespace) -> ModelSettings:
     """Return the network that was asked for; ConfigError when it cannot be."""
     if options.checkpoint:
         return ModelSettings.model_validate({"checkpoint": str(options.checkpoint.absolute())})
+    if not options.untrained:
+        return ModelSettings.model_validate({})
     try:
         return ModelSettings.model_validate({"untrained": True, "height": options.height, "width": options.width})
     except ValidationError as error:
@@ -168,7 +170,9 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--output", type=Path, default=Path("output/demo"), help="folder for the results [%(default)s]")
     parser.add_argument("--recording", type=Path, default=SAMPLE, help="what is played [the sample]")
-    parser.add_argument("--checkpoint", type=Path, help="trained network [an untrained one, whose depth means nothing]")
+    network = parser.add_mutually_exclusive_group()
+    network.add_argument("--checkpoint", type=Path, help="trained network [the package's own small one]")
+    network.add_argument("--untrained", action="store_true", help="random weights, whose depth means nothing")
     parser.add_argument(
         "--rate",
         type=positive,

@@ -68,11 +68,21 @@ class EvaluationSettings(MatchingSettings, ModelSettings):
 
         return None if self.no_occlusion_filter else OcclusionFilter()
 
+    @property
+    def checkpoint_path(self) -> Path | None:
+        """The checkpoint's file; None for a network with random weights and for a reference."""
+        return None if self.predictor else super().checkpoint_path
+
+    @property
+    def notice(self) -> str:
+        """What must be said of the network's depth."""
+        return "" if self.predictor else super().notice
+
     def dependencies(self) -> Dependencies:
         """Look at what this machine has; CheckpointError says what is wrong with the checkpoint."""
         from cvcdepth_core.checkpoint import load_checkpoint
 
-        path = Path(self.checkpoint).expanduser() if self.checkpoint else None
+        path = self.checkpoint_path
         return Dependencies(package_version(), load_checkpoint(path).sha256 if path else None)
 
     def build_predictor(self, rig: Rig) -> DepthPredictor:

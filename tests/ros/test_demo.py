@@ -74,7 +74,7 @@ def environment() -> Iterator[dict[str, str]]:
 @pytest.fixture(scope="module")
 def finished_demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, "subprocess.CompletedProcess[str]"]:
     output = tmp_path_factory.mktemp("demo")
-    command = [sys.executable, "-m", "cvcdepth_ros.demo", "--output", str(output), *SMALL]
+    command = [sys.executable, "-m", "cvcdepth_ros.demo", "--output", str(output)]
     with own_domain() as domain:
         environment = os.environ | {"ROS_DOMAIN_ID": str(domain)}
         return output, subprocess.run(command, env=environment, capture_output=True, text=True, timeout=150)
@@ -102,11 +102,11 @@ def test_the_table_on_the_terminal_says_what_the_file_says(finished_demo: Any):
     assert ["inference", f"{inference['p50_ms']:.1f}", f"{inference['p95_ms']:.1f}"] in lines
 
 
-def test_an_untrained_network_is_called_so(finished_demo: Any):
+def test_without_a_checkpoint_the_packages_own_model_is_shown_and_named(finished_demo: Any):
     output, process = finished_demo
-    assert process.stdout.splitlines()[0].startswith("UNTRAINED NETWORK: this depth means nothing")
-    assert "UNTRAINED NETWORK: this depth means nothing" in (output / "demo.html").read_text()
-    assert json.loads((output / "demo.json").read_text())["untrained"] is True
+    assert process.stdout.splitlines()[0] == NOTICE
+    assert json.loads((output / "demo.json").read_text())["untrained"] is False
+    assert "Network: default.safetensors" in (output / "demo.html").read_text()
 
 
 def test_every_set_has_its_picture_and_none_is_like_another(finished_demo: Any):
@@ -144,7 +144,7 @@ class RunningDemo:
 
     def __init__(self, output: Path, environment: dict[str, str]) -> None:
         self.output = output
-        command = [sys.executable, "-m", "cvcdepth_ros.demo", "--output", str(output), *SMALL]
+        command = [sys.executable, "-m", "cvcdepth_ros.demo", "--output", str(output)]
         self.process = subprocess.Popen(
             command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )

@@ -318,7 +318,7 @@ def test_qos_overrides_make_a_single_topic_match(graph, messages, rig_content, t
     ("parameters", "reason"),
     [
         ({"untrained": True}, "parameter rig is empty"),
-        ({"rig": "RIG"}, "name a checkpoint file, or set untrained"),
+        ({"rig": "RIG", "untrained": True, "checkpoint": "model.safetensors"}, "a checkpoint is trained; name none"),
         ({"rig": "/nowhere/rig.yaml", "untrained": True}, "rig file /nowhere/rig.yaml: cannot be read"),
         ({"rig": "RIG", "checkpoint": "/nowhere/model.safetensors"}, "/nowhere/model.safetensors: no such file"),
         ({"rig": "RIG", "checkpoint": "DAMAGED"}, "is damaged or not a safetensors file"),
