@@ -29,7 +29,10 @@ _USUAL_CAMERAS = 6
 
 
 def onnx_model(network: DepthNet, spec: DepthModelSpec) -> bytes:
-    """Return an ONNX model: `images` [B, 3, H, W] in [0, 1] to `disparity` [B, 1, H, W], H and W those of `spec`."""
+    """Return an ONNX model: `images` [B, 3, H, W] in [0, 1] to `disparity` [B, 1, H, W], of any B, H and W.
+
+    H and W are multiples of 32; those of `spec` are what the network was trained for.
+    """
     example = torch.zeros(1, 3, spec.height, spec.width)
     content = io.BytesIO()
     # The newer exporter needs two more packages and gives the same graph; torch before 2.5 does not know the word.
@@ -43,7 +46,7 @@ def onnx_model(network: DepthNet, spec: DepthModelSpec) -> bytes:
             opset_version=_OPSET,
             input_names=[INPUT],
             output_names=[OUTPUT],
-            dynamic_axes={INPUT: {0: "cameras"}, OUTPUT: {0: "cameras"}},
+            dynamic_axes={name: {0: "cameras", 2: "height", 3: "width"} for name in (INPUT, OUTPUT)},
             **older,  # type: ignore[arg-type]
         )
     return content.getvalue()

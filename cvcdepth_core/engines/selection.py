@@ -21,7 +21,12 @@ Backend = Literal["auto", "ncnn", "torch", "torch_eager", "torch_compiled", "onn
 
 BACKENDS: tuple[str, ...] = get_args(Backend)
 
-_PACKAGES = {"ncnn": "ncnn", "onnxruntime": "onnxruntime", "tensorrt": "onnxruntime"}
+# What has to be importable, and how to get it.
+_PACKAGES = {
+    "ncnn": (("ncnn",), "pip install ncnn"),
+    "onnxruntime": (("onnx", "onnxruntime"), "pip install 'cvcdepth_ros[onnx]'"),
+    "tensorrt": (("onnx", "onnxruntime"), "pip install onnx onnxruntime-gpu"),
+}
 _CPU_ONLY, _CUDA_ONLY = ("ncnn",), ("torch_compiled", "tensorrt")
 _HALF_PRECISION = ("torch", "torch_compiled", "tensorrt")
 
@@ -65,8 +70,12 @@ def resolve_device(name: str) -> torch.device:
 
 
 def is_installed(backend: str) -> bool:
-    """Tell whether the package behind a backend can be imported."""
-    return backend not in _PACKAGES or find_spec(_PACKAGES[backend]) is not None
+    """Tell whether the packages behind a backend are there."""
+    return backend not in _PACKAGES or not _missing(backend)
+
+
+def _missing(backend: str) -> list[str]:
+    return [package for package in _PACKAGES[backend][0] if find_spec(package) is None]
 
 
 def _place(device: str, backend: str) -> torch.device:
@@ -95,8 +104,8 @@ def _refuse_impossible(backend: str, device: torch.device, precision: Precision)
 
 def _refuse_missing(backend: str) -> None:
     if not is_installed(backend):
-        package = _PACKAGES[backend]
-        raise EngineError(f"backend {backend}: package {package} is not installed; pip install 'cvcdepth_ros[onnx]'")
+        missing, remedy = ", ".join(_missing(backend)), _PACKAGES[backend][1]
+        raise EngineError(f"backend {backend}: {missing} is not installed here: {remedy}")
 
 
 def _build(
