@@ -15,13 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvcdepth_core.calibration import Calibration, calibration_from_fields
-from cvcdepth_core.errors import ConfigError
-from cvcdepth_core.images import Picture, decode_compressed, decode_raw
+from cvcdepth_core.errors import ConfigError, RigError
+from cvcdepth_core.images import Picture, Reduction, decode_compressed, decode_raw, reduce_picture
 from cvcdepth_core.poses import Pose, quaternion_from_rotation
 from cvcdepth_ros.synchronizer import NANOSECONDS
 
 _FLOAT32_DATATYPE = 7  # sensor_msgs/PointField.FLOAT32
 _MILLIMETRES = 1000.0
+_MAX_COEFFICIENTS = 100
 _BIG_ENDIAN_HOST = sys.byteorder == "big"
 
 
@@ -31,17 +32,23 @@ def stamp_ns(message: Any) -> int:
     return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
 
 
-def picture_from_message(message: Any, camera: str) -> Picture:
-    """Decode a `sensor_msgs/Image` or `CompressedImage` to RGB; ImageError names the camera and what is wrong."""
+def picture_from_message(message: Any, camera: str, reduce: Reduction = 1) -> Picture:
+    """Decode a `sensor_msgs/Image` or `CompressedImage` to RGB, each `reduce` x `reduce` pixels to one.
+
+    ImageError names the camera and what is wrong.
+    """
     if hasattr(message, "format"):
-        return decode_compressed(message.format, message.data, camera)
-    return decode_raw(
+        return decode_compressed(message.format, message.data, camera, reduce=reduce)
+    picture = decode_raw(
         message.width, message.height, message.encoding, message.step, bool(message.is_bigendian), message.data, camera
     )
+    return reduce_picture(picture, reduce)
 
 
 def calibration_from_message(message: Any, camera: str) -> Calibration:
     """Validate a `sensor_msgs/CameraInfo`; RigError names the camera and the first impossible field."""
+    if len(message.d) > _MAX_COEFFICIENTS:
+        raise RigError(f"camera {camera}: camera_info: {len(message.d)} numbers in d; no model takes so many")
     region = message.roi
     return calibration_from_fields(
         camera,

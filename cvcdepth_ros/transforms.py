@@ -20,6 +20,12 @@ _SMALL_ANGLE = 1e-6
 _LONGEST_GAP = 0.6
 
 
+MAX_FRAMES = 5000
+"""Of a vehicle's fixed transforms; vehicles have some dozens."""
+_MAX_NAME = 255
+_SHOWN = 20
+
+
 def frame_name(frame_id: str) -> str:
     """Return the frame id without the leading slash that tf1 and some drivers write."""
     return frame_id.lstrip("/")
@@ -42,17 +48,19 @@ class TransformTree:
         Raises TransformError when the matrix is not rigid, the child has another parent already, or a loop would close.
         """
         parent, child = frame_name(parent), frame_name(child)
+        if child not in self._parents and len(self._parents) >= MAX_FRAMES:
+            raise TransformError(f"frame '{child}' is one too many: at most {MAX_FRAMES} are kept")
         check_rigid(parent_T_child, f"transform {parent} <- {child}")
         known, _ = self._parents.get(child, (parent, None))
         if known != parent:
             raise TransformError(f"frame '{child}' has two parents, '{known}' and '{parent}'")
-        if child in self._ancestors(parent):
-            raise TransformError(f"transform {parent} <- {child} closes a loop: {' <- '.join(self._ancestors(parent))}")
+        if child in self.ancestors(parent):
+            raise TransformError(f"transform {parent} <- {child} closes a loop: {' <- '.join(self.ancestors(parent))}")
         self._parents[child] = parent, np.array(parent_T_child, dtype=np.float64)
 
     def add_message(self, message: Any) -> None:
         """Add the transforms of a `tf2_msgs/TFMessage`; raises TransformError like `add`, and for a bad quaternion."""
-        for _, parent, child, parent_T_child in _links(message):
+        for _, parent, child, parent_T_child in links_of(message):
             self.add(parent, child, parent_T_child)
 
     def lookup(self, target_frame: str, source_frame: str) -> Pose:
@@ -76,15 +84,15 @@ class TransformTree:
             )
         return inverse(root_T_target) @ root_T_source
 
-    def _ancestors(self, frame: str) -> list[str]:
+    def ancestors(self, frame: str) -> list[str]:
         """Return the frame itself, its parent, and so on up to the root."""
-        chain = [frame]
+        chain = [frame_name(frame)]
         while chain[-1] in self._parents:
             chain.append(self._parents[chain[-1]][0])
         return chain
 
     def _to_root(self, frame: str) -> tuple[str, Pose]:
-        *links, root = self._ancestors(frame)
+        *links, root = self.ancestors(frame)
         root_T_frame = np.eye(4)
         for child in links:
             root_T_frame = self._parents[child][1] @ root_T_frame
@@ -123,7 +131,7 @@ class PoseTrack:
 
     def add_message(self, message: Any) -> None:
         """Add the transforms of a `tf2_msgs/TFMessage` that are of this link; the others are passed over."""
-        for stamp, parent, child, parent_T_child in _links(message):
+        for stamp, parent, child, parent_T_child in links_of(message):
             if (parent, child) == (self.parent, self.child):
                 self.add(stamp, parent_T_child)
 
@@ -155,11 +163,15 @@ class PoseTrack:
         del self._stamps[:needed], self._poses[:needed]
 
 
-def _links(message: Any) -> Iterator[tuple[int, str, str, Pose]]:
+def links_of(message: Any) -> Iterator[tuple[int, str, str, Pose]]:
     """Give stamp (ns), parent, child and parent_T_child of every transform of a TFMessage."""
     for link in message.transforms:
         stamp = link.header.stamp.sec * 10**9 + link.header.stamp.nanosec
         parent, child = frame_name(link.header.frame_id), frame_name(link.child_frame_id)
+        if max(len(parent), len(child)) > _MAX_NAME:
+            raise TransformError(
+                f"frame '{max(parent, child, key=len):.40}...' has a name of more than {_MAX_NAME} letters"
+            )
         t, q = link.transform.translation, link.transform.rotation
         pose = pose_from_quaternion((t.x, t.y, t.z), (q.x, q.y, q.z, q.w), f"transform {parent} <- {child}")
         yield stamp, parent, child, pose
