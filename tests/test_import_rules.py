@@ -27,6 +27,7 @@ NEEDS_ROS = {
         "player",
         "surround_depth_node",
         "surround_session",
+        "bench/straightforward_node",
         "commands/play",
         "demo/recorder",
     )

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The live part of the demo: node, recorder and player, each a process of its own, as on a vehicle."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,15 +32,27 @@ class LiveOutcome:
     lost: dict[str, int]
     """By topic: messages that DDS lost on the way to the recorder."""
     node: NodeReport
+    node_peak_mb: float
+    """The node's greatest resident size, MiB."""
 
 
 class LiveRun:
     """Starts the processes one after the other, each when the former is ready for it."""
 
-    def __init__(self, family: Children, paths: DemoPaths, node: str) -> None:
+    def __init__(
+        self,
+        family: Children,
+        paths: DemoPaths,
+        node: str,
+        module: str = "cvcdepth_ros.surround_depth_node",
+        inputs: Mapping[str, str] | None = None,
+    ) -> None:
+        """Take the node's program from `module`; `inputs` are topics of the player, and their types, to record too."""
         self._family = family
         self._paths = paths
         self._node_name = node
+        self._module = module
+        self._inputs = inputs or {}
         self._report: dict[str, Any] = {}
         self._equal_reports = 0
 
@@ -52,7 +64,7 @@ class LiveRun:
     def play(self, recording: Path, rate: float, duration: float, outputs: Sequence[Output]) -> LiveOutcome:
         """Play the recording to the node and record what it publishes, until its last set is done with."""
         self._node = self._family.start(
-            "node", "cvcdepth_ros.surround_depth_node", "--ros-args", "--params-file", str(self._paths.parameters)
+            "node", self._module, "--ros-args", "--params-file", str(self._paths.parameters)
         )
         self._recorder = self._start_recorder(outputs)
         wait_until("for the node and the recorder to find each other", self._ready, _START_SECONDS)
@@ -64,6 +76,7 @@ class LiveRun:
 
     def _start_recorder(self, outputs: Sequence[Output]) -> Child:
         topics = [argument for output in outputs for argument in ("--topic", output.topic, output.type_name)]
+        topics += [argument for topic, type_ in self._inputs.items() for argument in ("--input", topic, type_)]
         return self._family.start(
             "recorder", "cvcdepth_ros.demo.recorder", str(self._paths.recording), "--node", self._node_name, *topics
         )
@@ -91,6 +104,7 @@ class LiveRun:
             received=summary["received"],
             lost=summary["lost"],
             node=NodeReport.model_validate(self._report["node"]),
+            node_peak_mb=self._node.peak_memory_mb(),
         )
 
     def _ready(self) -> bool:

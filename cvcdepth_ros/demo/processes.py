@@ -86,6 +86,15 @@ class Child:
             raise self.failure(f"printed no JSON document ({error})") from error
         return document
 
+    def peak_memory_mb(self) -> float:
+        """Return its greatest resident size so far in MiB, as Linux tells; 0 where nothing does."""
+        try:
+            lines = Path(f"/proc/{self._process.pid}/status").read_text(encoding="utf-8").splitlines()
+        except OSError:
+            return 0.0
+        peak = next((line for line in lines if line.startswith("VmHWM:")), "VmHWM: 0 kB")
+        return int(peak.split()[1]) / 2**10
+
     def failure(self, reason: str) -> DemoError:
         """Return the error that names it, with its last lines."""
         lines = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()[-_LAST_LINES:]

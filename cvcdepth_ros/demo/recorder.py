@@ -43,17 +43,22 @@ class Recorder(Node):  # type: ignore[misc] # rclpy is not annotated
     """Subscribes topics and writes what arrives; `tell` is called with a report whenever the watched node makes one."""
 
     def __init__(
-        self, writer: RecordingWriter, topics: Mapping[str, str], watched: str, tell: Callable[[dict[str, Any]], None]
+        self,
+        writer: RecordingWriter,
+        topics: Mapping[str, str],  # of the watched node, with their types
+        inputs: Mapping[str, str],  # others, whose publishers come later
+        watched: str,
+        tell: Callable[[dict[str, Any]], None],
     ) -> None:
         super().__init__("demo_recorder")
         self._writer = writer
         self._watched = watched
         self._tell = tell
         self._unmatched = set(topics)
-        self.received = dict.fromkeys([*topics, DIAGNOSTICS_TOPIC], 0)
+        self.received = dict.fromkeys([*topics, *inputs, DIAGNOSTICS_TOPIC], 0)
         self.lost = dict.fromkeys(self.received, 0)
         self.last_message = time.monotonic()
-        for topic, type_name in topics.items():
+        for topic, type_name in {**topics, **inputs}.items():
             self._subscribe(topic, type_name)
         # Last of all. DDS makes subscriptions known in their order, so whoever reaches this one knows the others.
         self._subscribe(DIAGNOSTICS_TOPIC, _DIAGNOSTICS_TYPE)
@@ -107,10 +112,12 @@ class Recorder(Node):  # type: ignore[misc] # rclpy is not annotated
             self._tell({"ready": not self._unmatched, "node": report.model_dump(), **self.summary()})
 
 
-def record(output: Path, topics: Mapping[str, str], watched: str, idle_seconds: float) -> dict[str, Any]:
+def record(
+    output: Path, topics: Mapping[str, str], inputs: Mapping[str, str], watched: str, idle_seconds: float
+) -> dict[str, Any]:
     """Record until SIGINT or SIGTERM, or until nothing but diagnostics came for `idle_seconds`; return the summary."""
     with RecordingWriter(output) as writer:
-        recorder = Recorder(writer, topics, watched, _print_line)
+        recorder = Recorder(writer, topics, inputs, watched, _print_line)
         executor = SingleThreadedExecutor()
         executor.add_node(recorder)
         try:
@@ -133,7 +140,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     rclpy.init(args=[])
     try:
-        summary = record(options.output, dict(options.topic), options.node, options.idle_seconds)
+        summary = record(options.output, dict(options.topic), dict(options.input), options.node, options.idle_seconds)
     except CvcDepthError as error:
         print(f"recorder: {error}", file=sys.stderr)
         return 1
@@ -153,6 +160,9 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("output", type=Path, help="folder of the recording; must not exist")
     parser.add_argument("--topic", nargs=2, action="append", default=[], metavar=("NAME", "TYPE"), help="repeatable")
+    parser.add_argument(
+        "--input", nargs=2, action="append", default=[], metavar=("NAME", "TYPE"), help="as --topic, but not awaited"
+    )
     parser.add_argument("--node", default="/surround_depth", help="whose diagnostics are printed [%(default)s]")
     parser.add_argument(
         "--idle-seconds", type=float, default=60.0, help="end when no message came for so long [%(default)s]"

@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`bench`: measure the live node on a recording, over DDS, against the straightforward node."""
+
+import argparse
+import json
+import os
+import platform
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cvcdepth_core.errors import RecordingError
+from cvcdepth_ros.commands.arguments import add_recording, add_settings, positive, settings_from
+from cvcdepth_ros.settings import ModelSettings
+from cvcdepth_ros.version import package_version
+
+if TYPE_CHECKING:
+    from cvcdepth_core.rig import RigLayout
+    from cvcdepth_ros.demo.live_run import LiveOutcome
+    from cvcdepth_ros.demo.paths import DemoPaths
+
+SUMMARY = """Measure the live node on a recording, over DDS, against the straightforward node.
+
+Player, node and subscriber are processes of their own. The baseline is measured in the same run: a node that decodes,
+estimates (PyTorch, operation by operation) and publishes one set after the other. Prints one line of JSON. A rate at
+which sets are dropped measures throughput, one at which none is measures latency. Needs rclpy."""
+EXAMPLES: tuple[str, ...] = (
+    "bench drive/ --checkpoint model.safetensors",
+    "bench drive/ --untrained --height 192 --width 320 --seconds 10 --rate 2",
+)
+
+_NODE = "/surround_depth"
+_NODES = {"straightforward": "cvcdepth_ros.bench.straightforward_node", "node": "cvcdepth_ros.surround_depth_node"}
+_CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_recording(parser)
+    add_settings(parser, ModelSettings)
+    parser.add_argument("--seconds", type=positive, default=10.0, metavar="S", help="recorded seconds to play [10]")
+    parser.add_argument("--rate", type=positive, default=1.0, metavar="R", help="how many times real time [1]")
+    parser.add_argument("--no-baseline", action="store_true", help="leave the straightforward node out")
+
+
+def execute(arguments: argparse.Namespace) -> None:
+    """Measure and print."""
+    from cvcdepth_ros.bags import open_recording
+    from cvcdepth_ros.bench.repeated_recording import write_repeated
+    from cvcdepth_ros.recorded_rig import discover_rig
+
+    model = settings_from(arguments, ModelSettings)
+    with tempfile.TemporaryDirectory(prefix="cvcdepth_bench_") as folder, open_recording(arguments.recording) as source:
+        layout = discover_rig(source)
+        played = Path(folder) / "played"
+        write_repeated(source, layout, played, arguments.seconds)
+        names = ["node"] if arguments.no_baseline else list(_NODES)
+        found = {name: _measure(Path(folder), name, played, layout, model, arguments) for name in names}
+    print(json.dumps(_result(arguments, model, found)))
+
+
+def _measure(
+    folder: Path, name: str, played: Path, layout: "RigLayout", model: ModelSettings, arguments: argparse.Namespace
+) -> dict[str, Any]:
+    """Run one of the nodes."""
+    from cvcdepth_core.rig import save_rig_layout
+    from cvcdepth_ros.demo.live_run import LiveRun
+    from cvcdepth_ros.demo.paths import DemoPaths
+    from cvcdepth_ros.demo.processes import children
+    from cvcdepth_ros.demo.received import node_outputs
+
+    paths = DemoPaths(folder / name)
+    paths.prepare()
+    save_rig_layout(paths.rig, layout)
+    backend = {"backend": "torch_eager"} if name == "straightforward" else {}
+    _write_parameters(paths, model.model_copy(update=backend))
+    outputs = node_outputs(_NODE, layout.names, layout.anchor_camera)
+    info = next(c.camera_info_topic for c in layout.cameras if c.name == layout.anchor_camera)
+    with children(paths.logs) as family:
+        live = LiveRun(family, paths, _NODE, _NODES[name], {info: _CAMERA_INFO})
+        outcome = live.play(played, arguments.rate, arguments.seconds, outputs)
+    return _figures(paths, layout.anchor_camera, info, outcome)
+
+
+def _write_parameters(paths: "DemoPaths", model: ModelSettings) -> None:
+    import yaml
+
+    settings = {"rig": str(paths.rig.absolute()), "max_age": 0.0, "cloud_stride": 1}
+    parameters = settings | model.model_dump(exclude_defaults=True)
+    content = {_NODE.lstrip("/"): {"ros__parameters": parameters}}
+    paths.parameters.write_text(yaml.safe_dump(content), encoding="utf-8")
+
+
+def _figures(paths: "DemoPaths", anchor: str, info: str, outcome: "LiveOutcome") -> dict[str, Any]:
+    """Say how often depth came, how old it was, and where the time went.
+
+    Ages are those of the anchor's depth: from its camera_info's arrival at the subscriber to its own.
+    """
+    import numpy as np
+
+    from cvcdepth_ros.surround_messages import DEPTH
+
+    sent = _arrivals(paths.recording, info)
+    depth = _arrivals(paths.recording, f"{_NODE}/{anchor}/{DEPTH}")
+    if len(depth) < 3:
+        raise RecordingError(f"only {len(depth)} sets came back: play more seconds")
+    ages = np.array([(depth[stamp] - sent[stamp]) / 1e6 for stamp in depth.keys() & sent.keys()])
+    intervals = np.diff(sorted(depth.values())) / 1e6
+    # The recording's time and this machine's have nothing to do with each other.
+    latencies = {stage: found for stage, found in outcome.node.latencies.items() if "ROS time" not in stage}
+    stages = {stage: latency.model_dump() for stage, latency in latencies.items()}
+    median = float(np.median(intervals))
+    return {
+        "engine": outcome.node.model,
+        "sets_sent": len(sent),
+        "sets_received": len(depth),
+        "median_ms": round(median, 2),
+        "p95_ms": round(float(np.percentile(intervals, 95)), 2),
+        "per_second": round(1e3 / median, 3),
+        "age_ms": dict(zip(("p50", "p95", "max"), np.percentile(ages, [50, 95, 100]).round(1).tolist(), strict=True)),
+        "outside_inference": round(max(0.0, 1 - stages["inference"]["p50_ms"] / median), 3),
+        "peak_memory_mb": round(outcome.node_peak_mb),
+        "stages_ms": stages,
+    }
+
+
+def _arrivals(path: Path, topic: str) -> dict[int, int]:
+    """Return when (ns) each of the topic's messages came, by its stamp."""
+    from cvcdepth_ros.bags import open_recording
+    from cvcdepth_ros.messages import stamp_ns
+
+    with open_recording(path) as recording:
+        return {stamp_ns(recording.deserialize(m)): m.log_time for m in recording.messages([topic])}
+
+
+def _result(arguments: argparse.Namespace, model: ModelSettings, found: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    import numpy
+    import torch
+
+    ratio = found["straightforward"]["median_ms"] / found["node"]["median_ms"] if "straightforward" in found else None
+    return {
+        "benchmark": "bench",
+        "version": package_version(),
+        "machine": f"{platform.machine()}, {len(os.sched_getaffinity(0))} cores, load {os.getloadavg()[0]:.1f}",
+        "versions": {"python": platform.python_version(), "torch": torch.__version__, "numpy": numpy.__version__},
+        "recording": str(arguments.recording),
+        "rate": arguments.rate,
+        "model": model.model_dump(exclude_defaults=True),
+        **found["node"],
+        "baseline": found.get("straightforward"),
+        "times_baseline": None if ratio is None else round(ratio, 2),
+    }
