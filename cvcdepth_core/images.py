@@ -208,10 +208,10 @@ def _imdecode(encoded: bytes, encoding: str, reduce: Reduction, header: ImageHea
     if decoded is None or decoded.shape[:2] != (-(-header.height // factor), -(-header.width // factor)):
         return None
     picture = _to_rgb(decoded, encoding)
-    return picture if decoder_reduces else _averaged(picture, reduce)
+    return picture if decoder_reduces else reduce_picture(picture, reduce)
 
 
-def _averaged(picture: Picture, reduce: Reduction) -> Picture:
+def reduce_picture(picture: Picture, reduce: int) -> Picture:
     """Replace each `reduce` x `reduce` pixels by their mean; the last row and column are continued where they end."""
     if reduce == 1:
         return picture

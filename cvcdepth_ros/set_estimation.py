@@ -48,8 +48,8 @@ def picture_or_error(message: Any, camera: str, rectifier: Rectifier, latencies:
     """
     try:
         with latencies.measure("decode"):
-            picture = picture_from_message(message, camera)
+            picture = picture_from_message(message, camera, rectifier.reduction)
         with latencies.measure("preprocess"):
-            return rectifier(picture, camera)
+            return rectifier(picture, camera, rectifier.reduction)
     except ImageError as error:
         return error

@@ -147,7 +147,7 @@ class NetworkRig:
         masks = torch.from_numpy(self.preprocessor.valid).float()[:, None]
         intrinsics = torch.from_numpy(self.preprocessor.intrinsics).float()
         return RigBatch(
-            frames=frames.permute(0, 1, 2, 5, 3, 4).float() / 255,
+            frames=frames.permute(0, 1, 2, 5, 3, 4).contiguous().float() / 255,
             masks=masks.expand(samples, *masks.shape),
             intrinsics=intrinsics.expand(samples, *intrinsics.shape),
             base_T_camera=base_T_camera.float(),
@@ -264,7 +264,8 @@ class SampleReader(Dataset[ReadSample | None]):
         for camera, (name, message) in enumerate(zip(rig.names, messages, strict=True)):
             if message is None:
                 raise ImageError(f"camera {name}: the image of set {row} is not found again in the recording")
-            yield rig.preprocessor.rectify(camera, picture_from_message(message, name))
+            reduction = rig.preprocessor.rectifiers[name].reduction
+            yield rig.preprocessor.rectify(camera, picture_from_message(message, name, reduction), reduction)
 
     def _messages(self, recording: int, row: int) -> list[Any]:
         """Return each camera's message of a set, None where the recording has it no more."""

@@ -210,7 +210,7 @@ def test_a_rig_file_serves_a_recording_that_has_neither_transforms_nor_camera_in
         np.testing.assert_allclose(pose[:3], recorded[f"{name}_camera_optical_frame"][1][:3], atol=1e-9)
 
 
-@pytest.mark.parametrize("storage", ["sqlite", "ros1.bag", "split", "bgr8", "rgb8"])
+@pytest.mark.parametrize("storage", ["sqlite", "ros1.bag", "split"])
 def test_depth_does_not_depend_on_how_the_recording_stores_the_same_pixels(
     storage: str, two_sets: Path, tmp_path: Path
 ):
@@ -218,10 +218,18 @@ def test_depth_does_not_depend_on_how_the_recording_stores_the_same_pixels(
         "sqlite": lambda path: recordings.sqlite_copy(path, 2),
         "ros1.bag": lambda path: recordings.ros1_copy(path, 2),
         "split": lambda path: recordings.split_copy(path, 3, 2),
-        "bgr8": lambda path: recordings.raw_copy(path, "bgr8", 2),
-        "rgb8": lambda path: recordings.raw_copy(path, "rgb8", 2),
     }
     assert_same_depth(run(make[storage](tmp_path / storage), tmp_path / "depth"), two_sets)
+
+
+def test_raw_images_give_the_depth_of_the_jpeg_that_they_were_decoded_from(tmp_path: Path):
+    """Exactly so where the network is too fine for the JPEG decoder to reduce the pictures."""
+    fine = ("--height", "192", "--width", "320")
+    jpeg = recordings.write_rosbag2(tmp_path / "jpeg", recordings.sample_entries(1))
+    expected = run(jpeg, tmp_path / "expected", *fine)
+    for encoding in ("bgr8", "rgb8"):
+        raw = recordings.raw_copy(tmp_path / encoding, encoding, 1)
+        assert_same_depth(run(raw, tmp_path / f"{encoding}_depth", *fine), expected)
 
 
 @pytest.mark.parametrize(

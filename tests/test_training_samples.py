@@ -121,7 +121,9 @@ def test_pictures_are_those_that_the_node_would_see(index):
         for camera, entry in enumerate(index.layout.cameras):
             messages = [recording.deserialize(m) for m in recording.messages([entry.image_topic])]
             message = next(m for m in messages if stamp_ns(m) == index.stamps[7, camera])
-            expected = preprocessor.rectify(camera, picture_from_message(message, entry.name))
+            reduction = preprocessor.rectifiers[entry.name].reduction
+            picture = picture_from_message(message, entry.name, reduction)
+            expected = preprocessor.rectify(camera, picture, reduction)
             np.testing.assert_array_equal(pictures[camera], expected)
 
 
