@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from cvcdepth_core.errors import ConfigError, RecordingError, TransformError
 from cvcdepth_core.poses import Pose, inverse, pose_from_quaternion
 from cvcdepth_ros.bags import Recording
+from cvcdepth_ros.fixed_frames import MOVING_TRANSFORMS
 from cvcdepth_ros.messages import stamp_ns
 from cvcdepth_ros.synchronizer import NANOSECONDS
 from cvcdepth_ros.transforms import PoseTrack, TransformTree, frame_name
 
 CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
 ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
-MOVING_TRANSFORMS = "/tf"
 
 _FLOAT_TYPES = {7: "f4", 8: "f8"}  # sensor_msgs/PointField.FLOAT32 and FLOAT64
 _MESSAGES_TO_FIND_MOTION = 1000

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The rig of a recording: its cameras found, or a rig file's completed, from CameraInfo and `/tf_static`."""
+"""The rig of a recording: its cameras found, or a rig file's completed, from CameraInfo, `/tf_static` and `/tf`."""
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from itertools import islice
 from typing import Any
 
 from pydantic import ValidationError
@@ -11,7 +13,10 @@ from cvcdepth_core.errors import RecordingError, RigError, TransformError
 from cvcdepth_core.rig import CameraEntry, RigLayout
 from cvcdepth_ros.bags import Recording
 from cvcdepth_ros.camera_discovery import CAMERA_INFO_TYPE, COMPRESSED_IMAGE_TYPE, IMAGE_TYPE, discover_cameras
+from cvcdepth_ros.fixed_frames import MOVING_TRANSFORMS, add_fixed_frames, observed_links
+from cvcdepth_ros.lidar import cloud_topics
 from cvcdepth_ros.rig_assembly import RigAssembler
+from cvcdepth_ros.transforms import TransformTree, frame_name
 
 STATIC_TRANSFORMS = "/tf_static"
 IMAGE_TYPES = (IMAGE_TYPE, COMPRESSED_IMAGE_TYPE)
@@ -73,13 +78,16 @@ def assemble_rig(recording: Recording, layout: RigLayout) -> RigAssembler:
 
 
 def collect_rig(recording: Recording, layout: RigLayout) -> RigAssembler:
-    """Collect each camera's first CameraInfo and the static transforms, as far as they are recorded.
+    """Collect each camera's first CameraInfo and the fixed transforms, as far as they are recorded.
 
-    Raises TransformError for transforms that contradict each other.
+    Transforms are those of `/tf_static`; frames of cameras and LiDARs that are not connected there are looked for on
+    `/tf`, see `add_fixed_frames`. Raises TransformError for transforms that contradict each other, and for a camera
+    that moves.
     """
     assembler = RigAssembler(layout)
     _add_first_camera_infos(assembler, recording)
     _add_static_transforms(assembler, recording)
+    _add_fixed_frames(assembler, recording)
     return assembler
 
 
@@ -108,6 +116,40 @@ def _add_static_transforms(assembler: RigAssembler, recording: Recording) -> Non
             assembler.transforms.add_message(recording.deserialize(message))
         except TransformError as error:
             raise TransformError(f"{recording.path}: {STATIC_TRANSFORMS}: {error}") from error
+
+
+def _add_fixed_frames(assembler: RigAssembler, recording: Recording) -> None:
+    if MOVING_TRANSFORMS not in recording.topics:
+        return
+    tree, base_frame = assembler.transforms, assembler.layout.base_frame
+    open_cameras = [camera.name for camera in assembler.layout.cameras if camera.base_T_camera is None]
+    cameras = _unconnected(tree, base_frame, [assembler.frame_id(name) or "" for name in open_cameras])
+    lidars = _unconnected(tree, base_frame, [*_lidar_frames(recording)])
+    if not cameras and not lidars:
+        return
+    try:
+        links = observed_links(recording)
+        assembler.frames_on_tf += add_fixed_frames(tree, links, base_frame, cameras)
+    except TransformError as error:
+        raise TransformError(f"{recording.path}: {error}") from error
+    for lidar in lidars:
+        try:
+            assembler.frames_on_tf += add_fixed_frames(tree, links, base_frame, [lidar])
+        except TransformError as error:  # without it there is less truth, no less depth
+            tree.refused[frame_name(lidar)] = str(error)
+
+
+def _unconnected(tree: TransformTree, base_frame: str, frames: Sequence[str]) -> list[str]:
+    root = tree.ancestors(base_frame)[-1]
+    return [frame for frame in frames if tree.ancestors(frame)[-1] != root]
+
+
+def _lidar_frames(recording: Recording) -> Iterator[str]:
+    """Give the frame of each LiDAR's first sweep that can be read."""
+    for topic in cloud_topics(recording):
+        for message in islice(recording.messages([topic]), 1):
+            with suppress(RecordingError):
+                yield recording.deserialize(message).header.frame_id
 
 
 def topic_problems(recording: Recording, layout: RigLayout) -> Iterator[str]:

@@ -20,6 +20,8 @@ class RigAssembler:
     def __init__(self, layout: RigLayout) -> None:
         self.layout = layout
         self.transforms = TransformTree()
+        self.frames_on_tf: list[str] = []
+        """Sensor frames whose fixed poses a recording told on `/tf`, not `/tf_static`."""
         self._calibrations: dict[str, Calibration] = {}
         self._frame_ids: dict[str, str] = {}
         self._refused: dict[str, str] = {}

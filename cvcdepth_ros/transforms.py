@@ -36,6 +36,8 @@ class TransformTree:
 
     def __init__(self) -> None:
         self._parents: dict[str, tuple[str, Pose]] = {}  # child -> (parent, parent_T_child)
+        self.refused: dict[str, str] = {}
+        """Frames that cannot be connected, and why: what `lookup` says of them."""
 
     @property
     def frames(self) -> list[str]:
@@ -70,6 +72,9 @@ class TransformTree:
         """
         target, source = frame_name(target_frame), frame_name(source_frame)
         known = self.frames
+        for frame in (target, source):
+            if frame in self.refused:
+                raise TransformError(f"no transform {target} <- {source}: {self.refused[frame]}")
         for frame in (target, source):
             if frame not in known:
                 raise TransformError(

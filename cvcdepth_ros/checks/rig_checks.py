@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 
 from cvcdepth_ros.bags import Recording
 from cvcdepth_ros.checks.context import CheckContext, CheckResult
+from cvcdepth_ros.fixed_frames import MOVING_TRANSFORMS
 from cvcdepth_ros.recorded_rig import (
     IMAGE_TYPES,
     STATIC_TRANSFORMS,
@@ -74,7 +75,7 @@ def check_camera_infos(context: CheckContext) -> CheckResult:
 def check_transforms(context: CheckContext) -> CheckResult:
     """Look for each camera's pose in the base frame."""
     if context.contradiction is not None:
-        remedy = "one publisher of /tf_static too many: every frame has one parent"
+        remedy = "every frame needs one parent and one publisher, and those of cameras one fixed pose"
         return CheckResult("failed", context.contradiction, remedy)
     if context.assembler is None:
         return _without_cameras()
@@ -82,6 +83,8 @@ def check_transforms(context: CheckContext) -> CheckResult:
     problems = [problem for name in assembler.layout.names if (problem := assembler.transform_problem(name))]
     frames = assembler.transforms.frames
     passed, values = f"every camera is connected to {base_frame}", {"frames": frames}
+    if assembler.frames_on_tf:
+        passed += f" (on {MOVING_TRANSFORMS}, where they do not move: {', '.join(assembler.frames_on_tf)})"
     if not frames:
         remedy = f"record {STATIC_TRANSFORMS}, or give base_T_camera for every camera in a rig file (--rig)"
         problems = [f"nothing on {STATIC_TRANSFORMS}"] if problems else []
