@@ -5,8 +5,8 @@
 
 A sample is three sets of six pictures; the cache is off, so every picture of every sample is read, decoded, rectified
 and resized anew. All cases go over the same samples with as many worker processes, in turns: "decodes" only decodes
-them, at full resolution, from memory; "reduced decodes" does so at the resolution that the loader decodes at. The last
-line tells how large the processes were after each epoch.
+them, at full resolution, from memory; "reduced decodes" does so at the resolution that the loader decodes at.
+`mb_after_epochs` is how large this process and its workers were after each of some more epochs.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 
 import cv2
 import torch
-from measuring import circumstances, json_lines, measure_in_turns, print_line
+from measuring import json_lines, measure_in_turns, print_line
 from torch.utils.data import DataLoader, Dataset
 
 from cvcdepth_core.checkpoint import DepthModelSpec
@@ -39,14 +39,16 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         index = load_index(options.recording, Path(folder), MatchingSettings())
     batches = RecordingBatches([index], configuration(options))
-    sizes = {"samples": batches.samples, "pictures": len(index.layout.cameras) * 3, "workers": options.workers}
+    sizes: dict[str, object] = {
+        "samples": batches.samples,
+        "pictures": len(index.layout.cameras) * 3,
+        "workers": options.workers,
+    }
     sizes |= {"recording": options.recording.name, "network": f"{options.height}x{options.width}"}
     timings = measure_in_turns(cases(options, index, batches), options.rounds)
+    sizes["mb_after_epochs"] = memory_of_epochs(batches, options.epochs)
     for line in json_lines("loader", timings, "decodes", sizes):
         print_line(line | {"samples_per_second": round(batches.samples * line["per_second"], 2)})
-    print_line(
-        {"benchmark": "loader_memory", **sizes, "mb_after_epochs": memory_of_epochs(batches, options.epochs), **circumstances()}
-    )
 
 
 def parse_options() -> argparse.Namespace:
@@ -76,7 +78,8 @@ def cases(
     pictures = jpegs(index)
     rows = [(sample.target, sample.before, sample.after) for sample in batches.reader.samples]
     found: dict[str, Callable[[], object]] = {}
-    for name, reduce in (("decodes", 1), ("reduced decodes", reduction(batches.reader))):
+    reductions: dict[str, Reduction] = {"decodes": 1, "reduced decodes": reduction(batches.reader)}
+    for name, reduce in reductions.items():
         decodes = DataLoader(
             Decodes(pictures, rows, reduce),
             num_workers=options.workers,
