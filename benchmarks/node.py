@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The whole node: recording -> topics -> node -> subscriber over DDS, against the straightforward node.
+
+    .venv/bin/python benchmarks/node.py [--height 192 --width 320] [--seconds 20] [--rate 1]
+
+What `bag_replay bench` measures on the sample, as two lines in the form of the other benchmarks. Needs rclpy.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+from measuring import circumstances, print_line
+
+from cvcdepth_ros.bag_replay import main as bag_replay
+
+SAMPLE = Path(__file__).parent.parent / "samples" / "pandaset_002_excerpt"
+_SHARED = ("median_ms", "p95_ms", "per_second", "outside_inference", "peak_memory_mb")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--encoder", default="resnet18")
+    parser.add_argument("--height", type=int, default=192)
+    parser.add_argument("--width", type=int, default=320)
+    parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--rate", type=float, default=1.0)
+    options = parser.parse_args()
+    result = measured(options)
+    sizes = {"network": options.encoder, "picture": f"{options.height}x{options.width}", "rate": options.rate}
+    for case, found in (("straightforward", result["baseline"]), ("node", result)):
+        print_line(
+            {
+                "benchmark": "node",
+                "case": case,
+                **sizes,
+                **{name: found[name] for name in _SHARED},
+                "age_p50_ms": found["age_ms"]["p50"],
+                "age_p95_ms": found["age_ms"]["p95"],
+                "inference_p50_ms": found["stages_ms"]["inference"]["p50_ms"],
+                "baseline": "straightforward",
+                "times_baseline": round(result["baseline"]["median_ms"] / found["median_ms"], 3),
+                **circumstances(),
+            }
+        )
+
+
+def measured(options: argparse.Namespace) -> dict[str, Any]:
+    network = ["--untrained", "--encoder", options.encoder, "--height", str(options.height)]
+    played = ["--width", str(options.width), "--seconds", str(options.seconds), "--rate", str(options.rate)]
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        code = bag_replay(["bench", str(SAMPLE), *network, *played])
+    if code:
+        raise SystemExit(code)
+    result: dict[str, Any] = json.loads(printed.getvalue().splitlines()[-1])
+    return result
+
+
+if __name__ == "__main__":
+    main()
