@@ -20,6 +20,7 @@ pytest.importorskip("rclpy", reason="these tests need a ROS environment")
 from domains import own_domain
 from recordings import CAMERAS, JAZZY
 
+from cvcdepth_core.default_model import NOTICE
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.demo.node_report import Latency, read_report
 from cvcdepth_ros.demo.received import node_outputs
@@ -144,7 +145,7 @@ class RunningDemo:
 
     def __init__(self, output: Path, environment: dict[str, str]) -> None:
         self.output = output
-        command = [sys.executable, "-m", "cvcdepth_ros.demo", "--output", str(output)]
+        command = [sys.executable, "-m", "cvcdepth_ros.demo", "--output", str(output), "--untrained", *SMALL]
         self.process = subprocess.Popen(
             command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
