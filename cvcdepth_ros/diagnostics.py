@@ -8,6 +8,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from cvcdepth_core.estimator import DepthEstimator
+from cvcdepth_core.overlap_monitor import OverlapMonitor
 from cvcdepth_ros.camera_states import CameraCondition, CameraState, CameraWatch
 from cvcdepth_ros.latencies import StageSummary
 from cvcdepth_ros.mailbox import MailboxStatistics
@@ -77,6 +78,18 @@ def model_status(estimator: DepthEstimator) -> DiagnosticStatus:
     """Which network runs, and where."""
     values = {"device": estimator.device, "height": estimator.spec.height, "width": estimator.spec.width}
     return status(OK, "model", estimator.model_id, values)
+
+
+def overlap_status(monitor: OverlapMonitor) -> DiagnosticStatus:
+    """How well neighbouring cameras agree, pair by pair, and which of them have changed."""
+    values: dict[str, Any] = {}
+    for (camera, neighbour), pair in monitor.pairs().items():
+        values[f"{camera} - {neighbour}: turned (deg)"] = pair.misalignment
+        values[f"{camera} - {neighbour}: depth differs by"] = pair.disagreement
+        values[f"{camera} - {neighbour}: usually by"] = pair.usual_disagreement
+    values |= {f"{camera}: sharper by (log)": change for camera, change in monitor.sharpness_changes().items()}
+    findings = "; ".join(map(str, monitor.findings()))
+    return status(WARN if findings else OK, "cross-view consistency", findings or "ok", values)
 
 
 def _text(value: Any) -> str:

@@ -35,6 +35,8 @@ class NodeParameters(OutputSettings, MissingCameraSettings, MatchingSettings, Mo
     """Seconds without an image after which a camera counts as stale."""
     frozen_after: float = Field(1.0, ge=0, le=3600)
     """Seconds of the very same picture after which a camera counts as frozen and is left out; 0 accepts any."""
+    overlap_monitor: bool = True
+    """Compare neighbouring cameras in their overlaps, to tell of a shifted mount or a dirty lens in /diagnostics."""
     trace: str = ""
     """File for a trace of every stage that https://ui.perfetto.dev opens; at most 64 MB."""
 

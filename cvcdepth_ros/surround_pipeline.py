@@ -53,15 +53,21 @@ class SurroundPipeline:
         watches: Mapping[str, CameraWatch],
         wanted: Callable[[str], bool],
         publish: Callable[[PublishedSet], None],
+        observe: Callable[[PublishedSet], None],
         latencies: StageLatencies,
     ) -> None:
-        """`watches` has every camera; `wanted` says whether a camera's depth is; `publish` runs on its own thread."""
+        """Start the threads.
+
+        `watches` has every camera; `wanted` says whether a camera's depth is. `publish`, and `observe` for what has
+        been published, are called on a thread of their own.
+        """
         self._estimator = estimator
         self._synchroniser = synchroniser
         self._mailbox = mailbox
         self._watches = watches
         self._wanted = wanted
         self._publish = publish
+        self._observe = observe
         self._latencies = latencies
         self._surround: Future[SurroundDepthEstimator] | None = None
         self._pace = _InferencePace()
@@ -185,6 +191,7 @@ class SurroundPipeline:
         self._latencies.record("newest image to published", time.monotonic() - newest)
         self.counters["published"] += 1
         self.problem = ""
+        self._observe(estimate)
 
 
 class _InferencePace:

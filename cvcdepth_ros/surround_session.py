@@ -9,9 +9,16 @@ from rclpy.node import Node
 
 from cvcdepth_core.errors import CvcDepthError, TransformError
 from cvcdepth_core.estimator import DepthEstimator
-from cvcdepth_core.rig import RigLayout
+from cvcdepth_core.overlap_monitor import OverlapMonitor
+from cvcdepth_core.rig import Rig, RigLayout
 from cvcdepth_ros.camera_states import CameraCondition, CameraState, CameraWatch, Trouble, condition
-from cvcdepth_ros.diagnostics import camera_status, inference_status, model_status, synchronisation_status
+from cvcdepth_ros.diagnostics import (
+    camera_status,
+    inference_status,
+    model_status,
+    overlap_status,
+    synchronisation_status,
+)
 from cvcdepth_ros.inputs import CameraInputs, StaticTransformInput
 from cvcdepth_ros.latencies import StageLatencies
 from cvcdepth_ros.mailbox import Mailbox
@@ -44,6 +51,8 @@ class SurroundSession:
         )
         self._mailbox: Mailbox[CameraImage] = Mailbox(parameters.max_age or None, self._ros_time)
         self._watches = {name: CameraWatch(parameters.stale_after, parameters.frozen_after) for name in layout.names}
+        self._overlaps: OverlapMonitor | None = None
+        self._monitored_rig: Rig | None = None
         self._transforms = self._listen_for_transforms()
         self._outputs = SurroundOutputs(node, layout.names, parameters.depth_encoding, self.latencies)
         self._pipeline = SurroundPipeline(
@@ -53,6 +62,7 @@ class SurroundSession:
             self._watches,
             self._outputs.wanted,
             self._publish,
+            self._watch_overlaps if parameters.overlap_monitor else lambda _: None,
             self.latencies,
         )
         self._inputs = CameraInputs(node, layout, parameters.reliable, self._on_image, self._on_camera_info)
@@ -102,6 +112,7 @@ class SurroundSession:
             synchronisation_status(statistics, mailbox, self._pipeline.counters),
             inference_status(self.latencies.summaries(), mailbox, self.problem, self._estimator.model_id),
             model_status(self._estimator),
+            *([overlap_status(self._overlaps)] if self._overlaps else []),
         ]
 
     def _setup_troubles(self, camera: str) -> list[Trouble]:
@@ -156,6 +167,12 @@ class SurroundSession:
         self._outputs.publish(published.images, published.depth, published.rig, frame_ids, limits)
         age = self._ros_time() - max(published.images.stamps_ns.values())
         self.latencies.record("age of newest image at publish (ROS time)", age / 1e9)
+
+    def _watch_overlaps(self, published: PublishedSet) -> None:
+        if self._overlaps is None or self._monitored_rig is not published.rig:
+            self._overlaps, self._monitored_rig = OverlapMonitor(published.rig), published.rig
+        with self.latencies.measure("overlap monitor"):
+            self._overlaps.update(published.depth, published.images.stamp_ns)
 
     def _ros_time(self) -> int:
         return int(self._node.get_clock().now().nanoseconds)

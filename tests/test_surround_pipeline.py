@@ -82,6 +82,7 @@ class Running:
             self.watches,
             lambda camera: camera in self.wanted,
             self.published.append,
+            lambda _: None,
             self.latencies,
         )
 
