@@ -105,6 +105,10 @@ class Measurements:
             return self.sums[:0, 0, 0]
         return self.sums[:, self.cameras.index(camera), SCALINGS.index(scaling)]
 
+    def scales_of(self, camera: str) -> NDArray[np.float64]:
+        """Return the scales [S] of one camera, [0] where the rig has no such camera."""
+        return self.scales[:, self.cameras.index(camera)] if camera in self.cameras else self.scales[:0, 0]
+
     def to_json(self) -> dict[str, Any]:
         """Return it with JSON's types: the columns compressed, as the bytes of little-endian numbers."""
         columns = b"".join(
@@ -208,6 +212,11 @@ class Scores:
             }
         mean = {g: _mean_score([scores[g] for scores in cameras.values()]) for g in self.settings.groups}
         return Summary(cameras, mean)
+
+    def scale_ratios(self, protocol: Protocol = "image") -> dict[str, float]:
+        """Return median(truth) / median(prediction) of each camera, the geometric mean; 1 where the scale is right."""
+        tables = self.images if protocol == "image" else self.pools
+        return {camera: _geometric_mean([table.scales_of(camera) for table in tables]) for camera in self.cameras}
 
     def to_json(self) -> dict[str, Any]:
         """Return everything with JSON's types."""
@@ -335,6 +344,11 @@ def _mean_score(scores: Sequence[Score]) -> Score:
 
 def _means(metrics: Sequence[Mapping[str, float]]) -> dict[str, float]:
     return {name: mean([m[name] for m in metrics]) for name in METRIC_NAMES}
+
+
+def _geometric_mean(ratios: Sequence[NDArray[np.float64]]) -> float:
+    logarithms = np.log(np.concatenate(ratios))
+    return math.exp(mean(logarithms[np.isfinite(logarithms)].tolist()))
 
 
 def _json_by_group(scores: Mapping[str, Score]) -> dict[str, Any]:

@@ -134,6 +134,15 @@ def test_an_image_without_any_prediction_leaves_coverage_and_no_error():
     assert json.loads(json.dumps(score.to_json(), allow_nan=False))["abs_rel"] is None
 
 
+def test_the_scale_ratio_is_the_geometric_mean_over_the_images_with_a_prediction():
+    scorer = SurroundScorer("drive", ["front", "back"], ScoreSettings())
+    nothing = samples([math.nan], [1.0])
+    scorer.add(0, [samples([5.0], [10.0]), nothing])
+    scorer.add(1, [samples([20.0], [10.0]), samples([5.0, 5.0, 5.0], [1.0, 6.0, 9.0])])
+    scorer.add(2, [nothing, nothing])
+    assert scorer.scores().scale_ratios() == pytest.approx({"front": 1.0, "back": 1.2})
+
+
 def test_depth_limits_leave_truth_out_and_clamp_predictions():
     scorer = SurroundScorer("drive", ["front"], ScoreSettings(min_depth=1, max_depth=50))
     scorer.add(0, [samples([0.1, 500.0, 3.0, 3.0, 3.0], [2.0, 25.0, 1.0, 50.0, 0.5])])

@@ -16,7 +16,7 @@ import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from statistics import mean, stdev
+from statistics import geometric_mean, mean, stdev
 from typing import Any, NamedTuple
 
 import cv2
@@ -126,7 +126,8 @@ def summary(metrics: Mapping[str, Any]) -> tuple[float, float, float]:
     """Return scale-aware Abs Rel, median-scaled Abs Rel and the scale ratio, means over the cameras."""
     image = metrics["scores"]["image"]
     metric, scaled = (image[kind]["mean"]["all"] for kind in ("metric", "median"))
-    return metric["abs_rel"], scaled["abs_rel"], metric["scale_ratio"]
+    ratio = geometric_mean(metrics["scale_ratio"]["image"].values())
+    return metric["abs_rel"], scaled["abs_rel"], ratio
 
 
 def parse_options() -> argparse.Namespace:

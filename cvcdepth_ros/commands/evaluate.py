@@ -238,9 +238,12 @@ def _text(result: "EvaluationResult", folder: Path) -> str:
     from cvcdepth_core.scores import ALL
 
     summary, scaled = result.summary(), result.summary(scaling="median")
-    header = ("", "abs_rel", "median-scaled", "rmse", "delta_1", "coverage", "truth points")
-    groups = [(group, summary.mean[group], scaled.mean[group]) for group in result.scores.settings.groups]
-    cameras = [(name, found[ALL], scaled.cameras[name][ALL]) for name, found in summary.cameras.items()]
+    header = ("", "abs_rel", "median-scaled", "scale", "rmse", "delta_1", "coverage", "truth points")
+    ratios = result.scores.scale_ratios()
+    groups = [(group, summary.mean[group], scaled.mean[group], "") for group in result.scores.settings.groups]
+    cameras = [
+        (name, found[ALL], scaled.cameras[name][ALL], f"{ratios[name]:.2f}") for name, found in summary.cameras.items()
+    ]
     lines = [
         *(
             [table(header, [_row(*row) for row in (*cameras, *groups)], numbers=range(1, len(header)))]
@@ -254,9 +257,10 @@ def _text(result: "EvaluationResult", folder: Path) -> str:
     return "\n".join(lines)
 
 
-def _row(name: str, score: "Score", scaled: "Score") -> tuple[str, ...]:
-    numbers = (score.metrics["abs_rel"], scaled.metrics["abs_rel"], score.metrics["rmse"], score.metrics["delta_1"])
-    return (name, *(f"{number:.3f}" for number in (*numbers, score.coverage)), str(score.truth))
+def _row(name: str, score: "Score", scaled: "Score", ratio: str) -> tuple[str, ...]:
+    errors = (score.metrics["abs_rel"], scaled.metrics["abs_rel"])
+    others = (score.metrics["rmse"], score.metrics["delta_1"], score.coverage)
+    return (name, *(f"{e:.3f}" for e in errors), ratio, *(f"{number:.3f}" for number in others), str(score.truth))
 
 
 def _comparison_text(content: dict[str, Any]) -> str:

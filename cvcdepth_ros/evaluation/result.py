@@ -112,6 +112,7 @@ class EvaluationResult:
             "sets": len(self.sets),
             "truth_points": self.truth_points,
             "scores": {p: {s: self.summary(p, s).to_json() for s in SCALINGS} for p in PROTOCOLS},
+            "scale_ratio": {p: _without_nan(self.scores.scale_ratios(p)) for p in PROTOCOLS},
             "label_free": self._label_free(),
             "recordings": [recording.summary for recording in self.recordings],
             "failed": [failure._asdict() for failure in self.failed],
