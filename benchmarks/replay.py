@@ -1,78 +1,224 @@
 # SPDX-License-Identifier: Apache-2.0
 """How fast recordings are evaluated, where the time goes, and whether memory grows with their length.
 
-    .venv/bin/python benchmarks/replay.py [--repeat 1 10] [--height 384 --width 640] [--threads 1]
+    .venv/bin/python benchmarks/replay.py [--times 1 10] [--height 192 --width 320] [--rounds 1]
 
-Each length of the sample, played so many times one after the other, is evaluated in a process of its own, whose peak
-memory is that of the whole evaluation; torch alone takes part of it.
+The sample, played so many times one after the other, is evaluated on one CPU thread by `evaluate`, and by what one
+writes at first: everything read into lists, pictures undistorted one by one, the same network in eager torch, the
+nearest sweep projected, Abs Rel. The latter leaves out what evaluate does beside: occlusion filter, two protocols,
+ranges, overlaps, label-free scores. Each run has a process of its own; peak memory is that after the network is there.
 """
+
+from __future__ import annotations
 
 import argparse
 import json
-import resource
+import re
+import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
+import torch
+from measuring import circumstances, print_line
+from numpy.typing import NDArray
+from rosbags.highlevel import AnyReader
+
+from cvcdepth_core.estimator import DepthPredictor
+from cvcdepth_core.poses import Pose, inverse, pose_from_quaternion
+from cvcdepth_core.rig import Camera, Rig
 from cvcdepth_ros.bags import RecordedMessage, Recording, RecordingWriter, open_recording
 from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings
 from cvcdepth_ros.evaluation.recording import open_evaluation
+from cvcdepth_ros.lidar import points_from_message
+from cvcdepth_ros.messages import stamp_ns
+from cvcdepth_ros.recorded_rig import assemble_rig, discover_rig
 
 SAMPLE = Path(__file__).parent.parent / "samples" / "pandaset_002_excerpt"
 STEP_NS = 1_000_000_000  # the sample is ten sets, 10 Hz
+LIDAR = "/lidar/points"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--recording", type=Path, default=SAMPLE)
-    parser.add_argument("--repeat", type=int, nargs="+", default=[1, 10])
-    parser.add_argument("--height", type=int, default=384)
-    parser.add_argument("--width", type=int, default=640)
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--measure", help=argparse.SUPPRESS)
+    parser.add_argument("--times", type=int, nargs="+", default=[1, 10])
+    parser.add_argument("--height", type=int, default=192)
+    parser.add_argument("--width", type=int, default=320)
+    parser.add_argument("--rounds", type=int, default=1)
+    parser.add_argument("--measure", nargs=2, metavar=("CASE", "RECORDING"), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
+    torch.set_num_threads(1)
     if arguments.measure:
-        print(json.dumps(measured(arguments.measure, arguments)))
+        case, recording = arguments.measure
+        print(json.dumps(measured(CASES[case], recording, arguments)))
         return
     with tempfile.TemporaryDirectory() as folder:
-        for times in arguments.repeat:
+        for times in arguments.times:
             path = repeated(arguments.recording, Path(folder) / f"times_{times}", times)
-            command = [sys.executable, __file__, *sys.argv[1:], "--measure", str(path)]
-            done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
-            report(times, json.loads(done.stdout))
+            rounds = [{case: in_own_process(case, path) for case in CASES} for _ in range(arguments.rounds)]
+            for case in CASES:
+                print_line(line(case, times, rounds, arguments))
 
 
-def measured(recording: str, arguments: argparse.Namespace) -> dict[str, Any]:
-    """Evaluate in this process."""
-    settings = EvaluationSettings(
-        untrained=True, height=arguments.height, width=arguments.width, threads=arguments.threads, device="cpu"
-    )
-    with open_evaluation(EvaluationJob("benchmark", recording, settings)) as evaluation:
-        ready = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        began = time.monotonic()
-        scores = evaluation.scores()
-        seconds = time.monotonic() - began
-        stages = {name: summary.total_s for name, summary in evaluation.latencies.summaries().items()}
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+def in_own_process(case: str, recording: Path) -> dict[str, Any]:
+    command = [sys.executable, __file__, *sys.argv[1:], "--measure", case, str(recording)]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
+
+
+def line(
+    case: str, times: int, rounds: list[dict[str, dict[str, Any]]], arguments: argparse.Namespace
+) -> dict[str, Any]:
+    own, baseline = ([found[name] for found in rounds] for name in (case, "straightforward"))
+
+    def median(of: Callable[[dict[str, Any]], float]) -> float:
+        return statistics.median(map(of, own))
+
+    def ratio(name: str) -> float:
+        return statistics.median(b[name] / a[name] for a, b in zip(own, baseline, strict=True))
+
+    shares = {
+        f"{stage} %": round(100 * statistics.median(found["stages"][stage] for found in own))
+        for stage in own[0]["stages"]
+    }
     return {
-        "sets": scores.summary["sets"]["scored"],
-        "seconds": seconds,
-        "ready_mb": ready / 1024,
-        "peak_mb": peak / 1024,
-        "stages": stages | {"read and match": seconds - sum(stages.values())},
+        "benchmark": "replay",
+        "case": f"{case}, {own[0]['sets']} sets",
+        "times the sample": times,
+        "picture": f"{arguments.height}x{arguments.width}",
+        "rounds": len(rounds),
+        "median_ms": round(1e3 * median(lambda found: found["seconds"] / found["sets"]), 1),
+        "cpu_ms": round(1e3 * median(lambda found: found["cpu_seconds"] / found["sets"]), 1),
+        "per_second": round(median(lambda found: found["sets"] / found["seconds"]), 3),
+        "baseline": "straightforward",
+        "times_baseline": round(ratio("seconds"), 3),
+        "times_baseline_cpu": round(ratio("cpu_seconds"), 3),
+        "peak_memory_mb": round(median(lambda found: found["peak_mb"])),
+        "mb_before_the_first_set": round(median(lambda found: found["ready_mb"])),
+        **shares,
+        **circumstances(),
+        "threads": "1",
     }
 
 
-def report(times: int, found: dict[str, Any]) -> None:
-    rate = found["sets"] / found["seconds"]
-    print(f"{times} x: {found['sets']} sets in {found['seconds']:.1f} s, {rate:.2f} sets/s, ", end="")
-    print(f"peak {found['peak_mb']:.0f} MB ({found['ready_mb']:.0f} MB before the first set)")
-    for stage, seconds in sorted(found["stages"].items(), key=lambda item: -item[1]):
-        print(f"    {stage:15s} {1000 * seconds / found['sets']:7.1f} ms per set  {seconds / found['seconds']:5.1%}")
+def measured(
+    case: Callable[[str, EvaluationSettings], Callable[[], dict[str, float]]],
+    recording: str,
+    arguments: argparse.Namespace,
+) -> dict[str, Any]:
+    """Evaluate in this process."""
+    settings = EvaluationSettings(untrained=True, height=arguments.height, width=arguments.width, device="cpu")
+    work = case(recording, settings)
+    Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew, see proc(5)
+    ready, wall, cpu = memory_mb("VmRSS"), time.monotonic(), time.process_time()
+    stages = work()
+    seconds, cpu_seconds = time.monotonic() - wall, time.process_time() - cpu
+    sets = int(stages.pop("sets"))
+    return {
+        "sets": sets,
+        "seconds": seconds,
+        "cpu_seconds": cpu_seconds,
+        "ready_mb": ready,
+        "peak_mb": memory_mb("VmHWM"),
+        "stages": {name: took / seconds for name, took in stages.items()},
+    }
+
+
+def memory_mb(name: str) -> float:
+    """Return a value of /proc/self/status in MiB."""
+    return int(re.findall(rf"{name}:\s+(\d+) kB", Path("/proc/self/status").read_text())[0]) / 1024
+
+
+def evaluate(recording: str, settings: EvaluationSettings) -> Callable[[], dict[str, float]]:
+    """Return what evaluates, and tells the number of sets and the seconds of each stage."""
+    opened = ExitStack()
+    evaluation = opened.enter_context(open_evaluation(EvaluationJob("benchmark", recording, settings)))
+
+    def work() -> dict[str, float]:
+        with opened:
+            scores = evaluation.scores()
+        stages = {name: summary.total_s for name, summary in evaluation.latencies.summaries().items()}
+        return {"sets": scores.summary["sets"]["scored"], **stages}
+
+    return work
+
+
+def straightforward(recording: str, settings: EvaluationSettings) -> Callable[[], dict[str, float]]:
+    """Return what finds Abs Rel as one writes it at first."""
+    with open_recording(recording) as opened:
+        layout = discover_rig(opened)
+        rig, fixed = layout.complete(), assemble_rig(opened, layout).transforms
+    network = settings.model_copy(update={"backend": "torch_eager"}).build_estimator()
+
+    def work() -> dict[str, float]:
+        messages: dict[str, list[Any]] = defaultdict(list)
+        with AnyReader([Path(recording)]) as reader:
+            for connection, _, raw in reader.messages():
+                messages[connection.topic].append(reader.deserialize(raw, connection.msgtype))
+        odom_T_base = {stamp_ns(link): pose_of(link.transform) for m in messages["/tf"] for link in m.transforms}
+        errors = []
+        anchors = messages[layout.cameras[0].image_topic]
+        for anchor in anchors:
+            images = [nearest(messages[camera.image_topic], stamp_ns(anchor)) for camera in layout.cameras]
+            for image, camera, depth in zip(images, rig.cameras, estimated(images, rig, network), strict=True):
+                sweep = nearest(messages[LIDAR], stamp_ns(image))
+                base_T_lidar = fixed.lookup(rig.base_frame, sweep.header.frame_id)
+                odom_T_camera = odom_T_base[stamp_ns(image)] @ camera.base_T_camera
+                camera_T_lidar = inverse(odom_T_camera) @ odom_T_base[stamp_ns(sweep)] @ base_T_lidar
+                points = points_from_message(sweep, LIDAR) @ camera_T_lidar[:3, :3].T + camera_T_lidar[:3, 3]
+                errors.append(abs_rel(depth, points, camera))
+        if not np.isfinite(errors).all():
+            raise SystemExit("no truth in some picture")
+        return {"sets": len(anchors)}
+
+    return work
+
+
+def nearest(messages: list[Any], stamp: int) -> Any:
+    return min(messages, key=lambda message: abs(stamp_ns(message) - stamp))
+
+
+def pose_of(transform: Any) -> Pose:
+    t, q = transform.translation, transform.rotation
+    return pose_from_quaternion((t.x, t.y, t.z), (q.x, q.y, q.z, q.w))
+
+
+def estimated(images: list[Any], rig: Rig, network: DepthPredictor) -> NDArray[np.float32]:
+    size = network.spec.width, network.spec.height
+    pictures = []
+    for image, camera in zip(images, rig.cameras, strict=True):
+        raw = cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_COLOR_RGB)
+        c = camera.calibration
+        flat = cv2.undistort(raw, c.raw_intrinsics, c.distortion, None, c.rectified_intrinsics)
+        pictures.append(cv2.resize(flat, size, interpolation=cv2.INTER_AREA))
+    calibrations = [camera.calibration for camera in rig.cameras]
+    return network.estimate(
+        pictures, np.array([c.rectified_intrinsics[0, 0] * size[0] / c.image_size[0] for c in calibrations])
+    )
+
+
+def abs_rel(depth: NDArray[np.float32], points: NDArray[np.float64], camera: Camera) -> float:
+    """Compare depth with points [M, 3] in the camera's frame at the pixels where they are seen."""
+    width, height = camera.calibration.image_size
+    ahead = points[(points[:, 2] > 0) & (points[:, 2] < 80)]
+    u, v, z = (ahead @ camera.calibration.rectified_intrinsics.T).T
+    column, row = (u / z).round().astype(int), (v / z).round().astype(int)
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    full = cv2.resize(depth, (width, height))
+    return float(np.mean(np.abs(full[row[inside], column[inside]] - z[inside]) / z[inside]))
+
+
+CASES = {"straightforward": straightforward, "evaluate": evaluate}
 
 
 def repeated(source: Path, path: Path, times: int) -> Path:

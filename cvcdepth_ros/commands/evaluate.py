@@ -173,6 +173,9 @@ def _result(
     failed = [outcome for outcome in outcomes if isinstance(outcome, Failure)]
     for failure in failed if len(failed) < len(outcomes) else failed[1:]:
         warn(f"not evaluated: {failure.reason}")
+    models = sorted({outcome.summary["model"] for outcome in outcomes if not isinstance(outcome, Failure)})
+    if len(models) > 1:
+        warn(f"the recordings were not evaluated alike: {' and '.join(models)}")
     return EvaluationResult.of(jobs, outcomes, depends_on)
 
 
