@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The model card beside the weights: what they were made from, how, and what they are proven to be good for."""
+
+from __future__ import annotations
+
+import hashlib
+import html
+import json
+import platform
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from cvcdepth_core.atomic_file import write_atomically
+from cvcdepth_core.checkpoint import load_checkpoint
+from cvcdepth_core.errors import CvcDepthError
+from cvcdepth_ros.bags import file_identities
+from cvcdepth_ros.evaluation.result import EvaluationResult
+from cvcdepth_ros.finetuning.judgement import camera_numbers, known, numbers_of
+from cvcdepth_ros.finetuning.run import FineTuned, write_json
+from cvcdepth_ros.synchronizer import NANOSECONDS
+from cvcdepth_ros.training_index import RecordingIndex
+from cvcdepth_ros.version import package_version
+
+CARD_FILE, CARD_TEXT_FILE = "model_card.json", "model_card.md"
+
+SCORE_TITLES = {
+    "abs_rel": "Abs Rel",
+    "rmse": "RMSE (m)",
+    "delta_1": "δ < 1.25",
+    "scale": "scale",
+    "photometric": "photometric error",
+}
+
+
+def model_card(tuned: FineTuned) -> dict[str, Any]:
+    """Return the card's content, with JSON's types; docs/finetuning.md explains it."""
+    order, trainer = tuned.order, tuned.trainer
+    checkpoint = load_checkpoint(tuned.weights)
+    configuration = order.config.model_dump(mode="json")
+    return {
+        "weights": {"file": tuned.weights.name, "sha256": checkpoint.sha256, "step": checkpoint.metadata.get("step")},
+        "started_from": order.started_from,
+        "promoted": tuned.verdict.promoted,
+        "verdict": tuned.verdict.to_json(),
+        "scores": {"before": _scores(tuned.before), "after": _scores(tuned.after)},
+        "data": [_recording(tuned, i) for i in range(len(tuned.prepared.indexes))],
+        "left_out": tuned.prepared.left_out,
+        "warnings": tuned.prepared.warnings,
+        "rigs": _rigs(tuned.prepared.indexes),
+        "training": {
+            "epochs": trainer.progress.epoch,
+            "steps": trainer.progress.step,
+            "skipped_steps": trainer.progress.skipped,
+            "unreadable_batches": trainer.progress.unreadable,
+            "ended_early": trainer.progress.stopped,
+        },
+        "configuration": configuration,
+        "configuration_sha256": hashlib.sha256(json.dumps(configuration, sort_keys=True).encode()).hexdigest(),
+        "version": package_version(),
+        "made_with": {"torch": torch.__version__, "python": platform.python_version()},
+    }
+
+
+def write_card(folder: Path, card: Mapping[str, Any]) -> None:
+    """Write the card for programs and for people."""
+    write_json(folder / CARD_FILE, dict(card))
+    write_atomically(folder / CARD_TEXT_FILE, card_text(card).encode())
+
+
+def card_text(card: Mapping[str, Any]) -> str:
+    """Return the card as Markdown; whatever comes from files is escaped."""
+    return "\n".join([*_head(card), *_score_lines(card["scores"]), *_data_lines(card), *_how_lines(card), ""])
+
+
+def _scores(result: EvaluationResult | None) -> dict[str, Any] | None:
+    if result is None:
+        return None
+    return {"held_out": known(numbers_of(result)), "cameras": camera_numbers(result)}
+
+
+def _recording(tuned: FineTuned, number: int) -> dict[str, Any]:
+    index = tuned.prepared.indexes[number]
+    first, last = (int(stamp) for stamp in index.stamps[[0, -1], index.anchor])
+    try:
+        files = [list(identity) for identity in file_identities(index.path)]
+    except (CvcDepthError, OSError):
+        files = []  # gone meanwhile
+    return {
+        "recording": str(index.path),
+        "files": files,
+        "from": _time(first),
+        "seconds": (last - first) / NANOSECONDS,
+        "sets": len(index),
+        "outside_of_recorded_motion": index.unplaced,
+        "training_samples": tuned.samples[number],
+        "held_out_sets": sum(len(part.spans) for part in tuned.parts if part.job.path == str(index.path)),
+        "cameras": index.layout.names,
+    }
+
+
+def _rigs(indexes: Sequence[RecordingIndex]) -> list[dict[str, Any]]:
+    rigs: list[dict[str, Any]] = []
+    for index in indexes:
+        rig = index.layout.model_dump(mode="json", exclude_defaults=True)
+        if rig not in rigs:
+            rigs.append(rig)
+    return rigs
+
+
+def _time(stamp: int) -> str:
+    return datetime.fromtimestamp(stamp / NANOSECONDS, tz=timezone.utc).isoformat(timespec="seconds")
+
+
+def _head(card: Mapping[str, Any]) -> Iterator[str]:
+    weights = card["weights"]
+    yield f"# Model card of {_plain(weights['file'])}"
+    yield ""
+    yield f"**{'Promoted' if card['promoted'] else 'Not promoted'}**: {_plain(card['verdict']['reason'])}."
+    yield ""
+    yield f"* Weights: `{_plain(weights['file'])}`, sha256 `{weights['sha256']}`, step {_plain(weights['step'])}"
+    yield f"* Started from: {_plain(card['started_from'])}"
+    yield f"* Made with cvcdepth_ros {card['version']}, torch {card['made_with']['torch']}"
+    yield ""
+    yield "Depth of every camera around a vehicle, learned without labels from the recordings below. It was tried on"
+    yield "their last part only, which was not trained on: the same streets, weather and vehicle. Evaluate before use"
+    yield "elsewhere."
+    yield ""
+
+
+def _score_lines(scores: Mapping[str, Any]) -> Iterator[str]:
+    yield "## On the held-out part, before and after"
+    yield ""
+    before, after = scores["before"], scores["after"]
+    if before is None or after is None:
+        yield "Nothing was held out."
+        return
+    yield "| camera | " + " | ".join(SCORE_TITLES.values()) + " |"
+    yield "|---|" + "---|" * len(SCORE_TITLES)
+    for camera, numbers in before["cameras"].items():
+        cells = [_pair(numbers[name], after["cameras"].get(camera, {}).get(name)) for name in SCORE_TITLES]
+        yield f"| {_plain(camera)} | " + " | ".join(cells) + " |"
+    yield ""
+    yield "Scale is the median of median(truth) / median(prediction), 1 where depth is metric; the photometric error"
+    yield "needs no labels. A dash stands for what could not be measured."
+    yield ""
+
+
+def _data_lines(card: Mapping[str, Any]) -> Iterator[str]:
+    yield "## Data"
+    yield ""
+    yield "| recording | from | seconds | sets | training samples | held-out sets | cameras |"
+    yield "|---|---|---|---|---|---|---|"
+    for entry in card["data"]:
+        counts = (entry["sets"], entry["training_samples"], entry["held_out_sets"])
+        cells = (entry["recording"], entry["from"], f"{entry['seconds']:.1f}", *counts, ", ".join(entry["cameras"]))
+        yield f"| {' | '.join(_plain(cell) for cell in cells)} |"
+    yield ""
+    for reason in (*card["left_out"].values(), *card["warnings"]):
+        yield f"* {_plain(reason)}"
+    yield ""
+
+
+def _how_lines(card: Mapping[str, Any]) -> Iterator[str]:
+    training = card["training"]
+    yield "## Training"
+    yield ""
+    counts = f"{training['epochs']} epochs, {training['steps']} steps, {training['skipped_steps']} of them skipped"
+    yield f"{counts}; configuration (sha256 `{card['configuration_sha256']}`):"
+    yield ""
+    yield "```json"
+    yield json.dumps(card["configuration"], indent=2)
+    yield "```"
+
+
+def _pair(before: float | None, after: float | None) -> str:
+    return " → ".join("–" if number is None else f"{number:.3f}" for number in (before, after))
+
+
+def _plain(value: object) -> str:
+    """Return text that Markdown and HTML leave as it is, on one line."""
+    escaped = html.escape(" ".join(str(value).split()), quote=False)
+    return "".join(f"\\{letter}" if letter in "\\`*_[]|#" else letter for letter in escaped)

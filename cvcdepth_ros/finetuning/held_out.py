@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The held-out part of every recording, scored as `evaluate` scores it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from cvcdepth_core.training_config import TrainingConfig
+from cvcdepth_ros.bags import open_recording
+from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings
+from cvcdepth_ros.evaluation.result import EvaluationResult
+from cvcdepth_ros.evaluation.workers import KeptParts, evaluate_all
+from cvcdepth_ros.synchronizer import NANOSECONDS
+from cvcdepth_ros.training_index import RecordingIndex
+from cvcdepth_ros.training_samples import split_stamp
+
+_FEWEST_SETS = 2  # the scores along the way need two
+
+
+@dataclass(frozen=True)
+class HeldOutPart:
+    """The last sets of one recording, which are never trained on."""
+
+    job: EvaluationJob
+    """All of it."""
+    recording_start: int
+    """Log time of the recording's first message, ns."""
+    spans: tuple[tuple[int, int], ...]
+    """First and last log time of each set, ns."""
+
+    def between(self, first: int, count: int) -> EvaluationJob:
+        """Return the job that takes `count` sets from the `first` on."""
+        start, stop = self.spans[first][0], max(last for _, last in self.spans[first : first + count]) + 1
+        seconds = (start - self.recording_start) / NANOSECONDS
+        return replace(self.job, start=seconds, duration=(stop - start) / NANOSECONDS)
+
+
+def held_out_parts(indexes: Sequence[RecordingIndex], config: TrainingConfig, device: str) -> list[HeldOutPart]:
+    """Return the held-out part of each recording that has one."""
+    settings = EvaluationSettings.model_validate(
+        {
+            "tolerance": config.recordings.tolerance,
+            "max_depth": config.evaluation.max_depth,
+            "device": device,
+            "backend": "torch_eager",  # the network as it was trained; other engines are checked against it elsewhere
+            "threads": torch.get_num_threads(),
+        }
+    )
+    names = [index.path.name for index in indexes]
+    parts = []
+    for index, name in zip(indexes, names, strict=True):
+        unique = name if names.count(name) == 1 else str(index.path)
+        part = _held_out_part(index, EvaluationJob(unique, str(index.path), settings, index.layout), config)
+        if part is not None:
+            parts.append(part)
+    return parts
+
+
+def _held_out_part(index: RecordingIndex, job: EvaluationJob, config: TrainingConfig) -> HeldOutPart | None:
+    split = split_stamp(index, config.recordings.held_out)
+    log_times = index.log_times[np.flatnonzero(index.stamps[:, index.anchor] > split)]
+    if not len(log_times):
+        return None
+    with open_recording(index.path) as recording:
+        start = recording.start
+    spans = tuple((int(times.min()), int(times.max())) for times in log_times)
+    part = HeldOutPart(job, start, spans)
+    return replace(part, job=part.between(0, len(spans)))
+
+
+def some_sets(parts: Sequence[HeldOutPart], most: int) -> list[EvaluationJob]:
+    """Return jobs of `most` sets at most: some consecutive ones in the middle of each part, or of some of the parts."""
+    chosen = [parts[i] for i in np.unique(np.linspace(0, len(parts) - 1, max(1, most // _FEWEST_SETS)).astype(int))]
+    share = max(_FEWEST_SETS, most // len(chosen))
+    jobs = []
+    for part in chosen:
+        count = min(share, len(part.spans))
+        jobs.append(part.between((len(part.spans) - count) // 2, count))
+    return jobs
+
+
+def evaluate(
+    jobs: Sequence[EvaluationJob],
+    checkpoint: Path,
+    folder: Path | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> EvaluationResult:
+    """Score a checkpoint file; what `folder` holds of the very same work is not done again.
+
+    `progress` is told how many jobs are done. Raises RecordingError when no recording can be evaluated.
+    """
+    settings = jobs[0].settings.model_copy(update={"checkpoint": str(checkpoint)})
+    ready = [replace(job, settings=settings) for job in jobs]
+    depends_on = settings.dependencies()
+    kept = None if folder is None else KeptParts(folder, depends_on)
+    outcomes = [outcome for _, outcome in evaluate_all(ready, kept=kept, progress=progress)]
+    return EvaluationResult.of(ready, outcomes, depends_on)

@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Is a checkpoint better than the one it was made from? One number for each, and the proof that they differ."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from cvcdepth_core.comparison import Comparison, Difference, SetValues, compare, compare_values
+from cvcdepth_core.errors import ConfigError
+from cvcdepth_core.scores import ALL, mean
+from cvcdepth_ros.evaluation.frames import ImageScore
+from cvcdepth_ros.evaluation.result import EvaluationResult
+
+Basis = Literal["LiDAR", "label-free"]
+
+LABEL_FREE_SCORE = "photometric"
+"""Mean of the two photometric errors of an image, to its neighbours and to the picture before. Unlike disagreement it
+cannot be made good by depth that is consistent and wrong: it has to explain the pictures."""
+
+LIDAR_SCORE = "abs_rel"
+_LOST_AT_MOST = 0.1  # of the images: depth that sees nothing of the others is no progress
+_SHOWN_METRICS = ("abs_rel", "rmse", "delta_1")
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the comparison of before and after says."""
+
+    promoted: bool
+    reason: str
+    """In words, with the numbers."""
+    basis: Basis | None = None
+    """What it was decided by; None where nothing could be compared."""
+    score: str | None = None
+    """The name of the number; lower is better."""
+    difference: Difference | None = None
+    comparison: Comparison | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it with JSON's types."""
+        comparison = None
+        if self.comparison is not None:
+            comparison = {name: value for name, value in asdict(self.comparison).items() if name != "differences"}
+            differences = {name: known(asdict(one)) for name, one in self.comparison.differences.items()}
+            comparison["differences"] = differences
+        return {
+            "promoted": self.promoted,
+            "reason": self.reason,
+            "basis": self.basis,
+            "score": self.score,
+            "difference": None if self.difference is None else known(asdict(self.difference)),
+            "comparison": comparison,
+        }
+
+
+def judge(before: EvaluationResult, after: EvaluationResult) -> Verdict:
+    """Compare two evaluations of the same sets: by the LiDAR's truth where both have any, else without labels."""
+    basis: Basis = "LiDAR" if before.truth_points and after.truth_points else "label-free"
+    score = LIDAR_SCORE if basis == "LiDAR" else LABEL_FREE_SCORE
+    try:
+        comparison = compare(before.scores, after.scores) if basis == "LiDAR" else _compare_label_free(before, after)
+    except ConfigError as error:
+        return Verdict(False, f"nothing was proven: {error}")
+    difference = comparison.differences[score]
+    promoted = difference.high < 0  # False for NaN
+    interval = f"{comparison.level:.0%} interval {difference.low:+.4f} to {difference.high:+.4f}"
+    numbers = (
+        f"{_name(score)} {difference.first:.4f} before, {difference.second:.4f} after, difference "
+        f"{difference.difference:+.4f} ({interval}, {comparison.sets} held-out sets)"
+    )
+    words = "better than the start" if promoted else "not proven to be better than the start"
+    by = "by the LiDAR" if basis == "LiDAR" else "without LiDAR, by how well the depth explains the pictures"
+    return Verdict(promoted, f"{words}, {by}: {numbers}", basis, score, difference, comparison)
+
+
+def score_of(result: EvaluationResult) -> float:
+    """Return the number that validations are ranked by, lower is better; NaN where nothing could be measured."""
+    if result.truth_points:
+        return result.summary().mean[ALL].metrics[LIDAR_SCORE]
+    return mean([value for image in result.images if not math.isnan(value := photometric(image))])
+
+
+def numbers_of(result: EvaluationResult) -> dict[str, float]:
+    """Return what is worth following over a run; what could not be measured is left out."""
+    metrics = result.summary().mean[ALL].metrics
+    found = {"score": score_of(result), "sets": float(len(result.sets))}
+    found |= {name: metrics[name] for name in _SHOWN_METRICS}
+    found |= {"scale": _median([image.scale for image in result.images])}
+    found |= {
+        name: mean([v for image in result.images if not math.isnan(v := getattr(image.label_free, name))])
+        for name in ("spatial", "temporal", "spatial_photometric", "temporal_photometric")
+    }
+    return {name: value for name, value in found.items() if not math.isnan(value)}
+
+
+def camera_numbers(result: EvaluationResult) -> dict[str, dict[str, float | None]]:
+    """Return the numbers of each camera; None for what could not be measured."""
+    cameras = result.summary().cameras
+    return {camera: known(_camera_numbers(result, camera, cameras[camera][ALL].metrics)) for camera in cameras}
+
+
+def photometric(image: ImageScore) -> float:
+    """Return the image's label-free score; NaN where its picture cannot be compared with another."""
+    errors = (image.label_free.spatial_photometric, image.label_free.temporal_photometric)
+    return mean([error for error in errors if not math.isnan(error)])
+
+
+def known(numbers: Mapping[str, float]) -> dict[str, float | None]:
+    """Put None in the place of NaN, which JSON does not have."""
+    return {name: None if math.isnan(number) else number for name, number in numbers.items()}
+
+
+def _camera_numbers(result: EvaluationResult, camera: str, metrics: Mapping[str, float]) -> dict[str, float]:
+    images = [image for image in result.images if image.camera == camera]
+    shown = {name: metrics[name] for name in _SHOWN_METRICS}
+    label_free = mean([value for image in images if not math.isnan(value := photometric(image))])
+    return {**shown, "scale": _median([image.scale for image in images]), LABEL_FREE_SCORE: label_free}
+
+
+def _compare_label_free(before: EvaluationResult, after: EvaluationResult) -> Comparison:
+    """Compare over the images that have a score in both; raises ConfigError when too many have lost theirs."""
+    cameras = before.scores.cameras
+    first, second = (_label_free_values(result, cameras) for result in (before, after))
+    scored, lost = 0, 0
+    for key in first.keys() & second.keys():
+        unknown = np.isnan(second[key])
+        scored, lost = scored + int((~np.isnan(first[key])).sum()), lost + int((unknown & ~np.isnan(first[key])).sum())
+        first[key] = np.where(unknown, np.nan, first[key])
+    if lost > _LOST_AT_MOST * scored:
+        raise ConfigError(f"comparison: {lost} of {scored} images have a label-free score before, but none after")
+    return compare_values(first, second, [LABEL_FREE_SCORE])
+
+
+def _label_free_values(result: EvaluationResult, cameras: Sequence[str]) -> SetValues:
+    values: SetValues = {}
+    for image in result.images:
+        key = (image.recording, image.stamp_ns)
+        found = values.setdefault(key, np.full((len(cameras), 1), np.nan))
+        found[cameras.index(image.camera)] = photometric(image)
+    return values
+
+
+def _median(values: Sequence[float]) -> float:
+    numbers = [value for value in values if not math.isnan(value)]
+    return float(np.median(numbers)) if numbers else math.nan
+
+
+def _name(score: str) -> str:
+    return {LIDAR_SCORE: "Abs Rel", LABEL_FREE_SCORE: "photometric error"}[score]

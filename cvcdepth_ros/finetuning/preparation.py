@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What has to be right and known before the first step: checks, indexes, and masks of the vehicle's own body.
+
+Everything is kept in the run's folder, so that the same command again, and the other processes of a run, find it there.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Collection, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+from cvcdepth_core.atomic_file import write_atomically
+from cvcdepth_core.errors import CvcDepthError, RecordingError
+from cvcdepth_core.rig import RigLayout
+from cvcdepth_ros.bags import Location, file_identities, open_recording
+from cvcdepth_ros.checks import CheckContext, CheckOptions, CheckResult, NumberedResult, run_checks
+from cvcdepth_ros.self_occlusion import find_self_occlusion, save_masks
+from cvcdepth_ros.settings import MatchingSettings
+from cvcdepth_ros.training_index import RecordingIndex, load_index
+from cvcdepth_ros.version import package_version
+
+NOT_NEEDED: Collection[str] = ("stamps", "LiDAR")
+"""Checks whose failure does not spoil a training: the check of sets tells what odd stamps cost."""
+
+_CHECKS_FOLDER, _INDEX_FOLDER, _MASKS_FOLDER, _FOUND_FILE = "checks", "index", "masks", "found.json"
+
+
+@dataclass(frozen=True)
+class Source:
+    """What to train on."""
+
+    recordings: Sequence[Location]
+    layout: RigLayout | None
+    """The rig file's; None: the cameras found in each recording."""
+    matching: MatchingSettings
+    skipped_checks: Collection[str] = ()
+    with_masks: bool = True
+    """Whether to look for the vehicle's own body where the rig has no mask."""
+
+
+@dataclass
+class Prepared:
+    """What was found."""
+
+    indexes: list[RecordingIndex] = field(default_factory=list)
+    """Of the recordings that can be used, with masks."""
+    left_out: dict[str, str] = field(default_factory=dict)
+    """Why the others cannot."""
+    warnings: list[str] = field(default_factory=list)
+    found_masks: dict[str, Path] = field(default_factory=dict)
+    """Masks of the vehicle's own body that were found, by a name for each."""
+
+
+def prepare(source: Source, run: Path) -> Prepared:
+    """Check and index the recordings; RecordingError, with every reason, when none can be used."""
+    prepared = Prepared()
+    for path in source.recordings:
+        try:
+            problems = [found for found in checked(path, source, run) if found.result.status in ("failed", "warning")]
+            _refuse(path, problems)
+            prepared.indexes.append(load_index(path, run / _INDEX_FOLDER, source.matching, source.layout))
+            prepared.warnings += [_told(path, problem) for problem in problems]
+        except CvcDepthError as error:
+            prepared.left_out[str(path)] = str(error)
+    if not prepared.indexes:
+        raise RecordingError("; ".join(prepared.left_out.values()))
+    if source.with_masks:
+        _add_masks(prepared, run)
+    return prepared
+
+
+def checked(path: Location, source: Source, run: Path) -> list[NumberedResult]:
+    """Run the checks of `bag_replay check`, or return what they found before in the very same recording and rig."""
+    options = CheckOptions(tolerance=source.matching.tolerance, queue_size=source.matching.queue_size)
+    layout = source.layout
+    key = {
+        "version": package_version(),
+        "files": file_identities(path),
+        "options": asdict(options),
+        "skipped": sorted(source.skipped_checks),
+        "rig": None if layout is None else layout.model_dump(mode="json"),
+    }
+    kept = run / _CHECKS_FOLDER / f"{path.name}-{_digest(str(path))}.json"
+    found = _read(kept, _digest(json.dumps(key)))
+    if found is None:
+        with open_recording(path) as recording:
+            found = run_checks(CheckContext(recording, options, layout), source.skipped_checks)
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        content = {"key": _digest(json.dumps(key)), "checks": [(n, name, asdict(result)) for n, name, result in found]}
+        write_atomically(kept, json.dumps(content).encode())
+    return found
+
+
+def _read(kept: Path, key: str) -> list[NumberedResult] | None:
+    try:
+        content = json.loads(kept.read_text(encoding="utf-8"))
+        if content["key"] != key:
+            return None
+        return [NumberedResult(number, name, CheckResult(**result)) for number, name, result in content["checks"]]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _refuse(path: Location, problems: Sequence[NumberedResult]) -> None:
+    fatal = [found for found in problems if found.result.status == "failed" and found.name not in NOT_NEEDED]
+    if fatal:
+        raise RecordingError("; ".join(_told(path, found) for found in fatal))
+
+
+def _told(path: Location, found: NumberedResult) -> str:
+    remedy = f" -> {found.result.remedy}" if found.result.remedy else ""
+    return f"{path}: check {found.number}, {found.name}: {found.result.finding}{remedy}"
+
+
+def _add_masks(prepared: Prepared, run: Path) -> None:
+    """Find the vehicle's own body once for every rig, in its longest recording."""
+    layouts: list[RigLayout] = []
+    for index in prepared.indexes:
+        if index.layout not in layouts:
+            layouts.append(index.layout)
+    for layout in layouts:
+        indexes = [index for index in prepared.indexes if index.layout == layout]
+        masked = _masked(max(indexes, key=len), run)
+        prepared.indexes = [
+            replace(index, layout=masked) if index.layout == layout else index for index in prepared.indexes
+        ]
+        new = {camera.name: camera.mask for camera in masked.cameras if camera not in layout.cameras}
+        folder = f"{_digest(layout.model_dump_json())}/" if len(layouts) > 1 else ""
+        prepared.found_masks |= {f"{folder}{name}": mask for name, mask in new.items() if mask is not None}
+
+
+def _masked(index: RecordingIndex, run: Path) -> RigLayout:
+    """Return the layout with the masks that were found in the recording, now or before."""
+    layout = index.layout
+    folder = run / _MASKS_FOLDER / _digest(layout.model_dump_json())
+    try:
+        names = json.loads((folder / _FOUND_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        masked = save_masks(layout, find_self_occlusion(index), folder)
+        names = [camera.name for camera in masked.cameras if camera not in layout.cameras]
+        folder.mkdir(parents=True, exist_ok=True)
+        write_atomically(folder / _FOUND_FILE, json.dumps(names).encode())
+        return masked
+    cameras = [
+        camera.model_copy(update={"mask": folder / f"{camera.name}.png"}) if camera.name in names else camera
+        for camera in layout.cameras
+    ]
+    return layout.model_copy(update={"cameras": tuple(cameras)})
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:8]

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A whole fine-tuning: prepare, score the start, train, judge, promote, and leave the evidence beside the weights."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cvcdepth_core.atomic_file import write_atomically
+from cvcdepth_core.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from cvcdepth_core.distributed import Processes, own_device
+from cvcdepth_core.engines import resolve_device
+from cvcdepth_core.errors import CheckpointError
+from cvcdepth_core.surround_model import SurroundModel
+from cvcdepth_core.training import CHECKPOINT_FILE, RunObserver, Trainer, build_surround_model
+from cvcdepth_core.training_config import TrainingConfig
+from cvcdepth_ros.evaluation.result import EvaluationResult
+from cvcdepth_ros.finetuning.held_out import HeldOutPart, evaluate, held_out_parts, some_sets
+from cvcdepth_ros.finetuning.judgement import Verdict, judge
+from cvcdepth_ros.finetuning.monitoring import TensorBoardObserver, has_tensorboard
+from cvcdepth_ros.finetuning.preparation import Prepared, Source, prepare
+from cvcdepth_ros.finetuning.validation import CANDIDATE_FILE, HeldOutValidation
+from cvcdepth_ros.training_samples import RecordingBatches
+from cvcdepth_ros.version import package_version
+
+START_FILE, BEST_FILE = "start.safetensors", "best.safetensors"
+
+_START_KEY = "start"
+_SCORES_FOLDER = "scores"
+
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Order:
+    """What is to be done."""
+
+    source: Source
+    config: TrainingConfig
+    run: Path
+    """The run's folder."""
+    start: Checkpoint | None
+    """Weights to start from; None: random ones."""
+    device: str = "auto"
+    quiet: bool = False
+
+    @property
+    def started_from(self) -> str:
+        """What the weights that it starts from are, in words."""
+        return "random weights" if self.start is None else f"{self.start.path.name} sha256:{self.start.sha256}"
+
+
+@dataclass(frozen=True, eq=False)
+class FineTuned:
+    """What became of it."""
+
+    order: Order
+    prepared: Prepared
+    trainer: Trainer
+    samples: list[int]
+    """Training samples of each recording."""
+    parts: list[HeldOutPart]
+    weights: Path
+    """What was judged: the best file where it was promoted, else the candidate, else the last weights."""
+    before: EvaluationResult | None
+    """Of the whole held-out part; None where nothing is held out."""
+    after: EvaluationResult | None
+    verdict: Verdict
+
+
+def fine_tune(order: Order, processes: Processes, tell: Tell) -> FineTuned | None:
+    """Do all of it; `tell` is called with what is worth a line meanwhile. None in every process but the first.
+
+    What a former call in the same folder has finished is not done again.
+    """
+    with processes.first_goes_ahead():
+        prepared = prepare(order.source, order.run)
+    if processes.is_first:
+        for text in (*(f"left out: {reason}" for reason in prepared.left_out.values()), *prepared.warnings):
+            tell(text)
+    batches = RecordingBatches(prepared.indexes, order.config, processes)
+    model = build_surround_model(order.config, order.start)
+    device = own_device(resolve_device(order.device))
+    parts = held_out_parts(prepared.indexes, order.config, str(device)) if processes.is_first else []
+    before = _scores_of_start(order, model, parts) if parts else None
+    observers = [TensorBoardObserver(order.run)] if processes.is_first and has_tensorboard() else []
+    trainer = _trainer(order, model, batches, parts, processes, observers)
+    try:
+        trainer.train(quiet=order.quiet)
+    finally:
+        for observer in observers:
+            observer.close()
+    if not processes.is_first:
+        return None
+    weights, after, verdict = _judged(order.run, parts, before)
+    samples = [sum(sample.recording == i for sample in batches.reader.samples) for i in range(len(prepared.indexes))]
+    return FineTuned(order, prepared, trainer, samples, parts, weights, before, after, verdict)
+
+
+def _trainer(
+    order: Order,
+    model: SurroundModel,
+    batches: RecordingBatches,
+    parts: list[HeldOutPart],
+    processes: Processes,
+    observers: list[TensorBoardObserver],
+) -> Trainer:
+    config = order.config
+    watching: list[RunObserver] = [*observers]
+    validation = None
+    if parts:
+        validation = HeldOutValidation(some_sets(parts, config.evaluation.sets), order.run, config.evaluation.patience)
+    return Trainer(
+        config,
+        model,
+        batches,
+        order.run,
+        own_device(resolve_device(order.device)),
+        validation,
+        _metadata(order),
+        watching,
+        processes,
+    )
+
+
+def _metadata(order: Order) -> dict[str, str]:
+    config = order.config.model_dump_json()
+    return {"version": package_version(), "config": config, _START_KEY: order.started_from}
+
+
+def _scores_of_start(order: Order, model: SurroundModel, parts: list[HeldOutPart]) -> EvaluationResult:
+    """Score what the run starts from; CheckpointError when the run in this folder started from other weights."""
+    path = order.run / START_FILE
+    if not path.exists():
+        states = (model.depth_net.state_dict(), model.pose_net.state_dict())
+        save_checkpoint(path, order.config.depth, *states, _metadata(order))
+    found = load_checkpoint(path).metadata.get(_START_KEY)
+    if found != order.started_from:
+        raise CheckpointError(f"{order.run}: its run started from {found}, now it is {order.started_from}")
+    return evaluate([part.job for part in parts], path, order.run / _SCORES_FOLDER / "before")
+
+
+def _judged(
+    run: Path, parts: list[HeldOutPart], before: EvaluationResult | None
+) -> tuple[Path, EvaluationResult | None, Verdict]:
+    """Score the candidate, compare it with the start, and promote it or not."""
+    best, candidate = run / BEST_FILE, run / CANDIDATE_FILE
+    if before is None:
+        best.unlink(missing_ok=True)
+        reason = "nothing was proven: no recording has a held-out part (recordings.held_out)"
+        return run / CHECKPOINT_FILE, None, Verdict(False, reason)
+    weights = candidate if candidate.exists() else run / CHECKPOINT_FILE
+    after = evaluate([part.job for part in parts], weights, run / _SCORES_FOLDER / "after")
+    verdict = judge(before, after)
+    if verdict.promoted:
+        write_atomically(best, weights.read_bytes())
+        return best, after, verdict
+    best.unlink(missing_ok=True)
+    return weights, after, verdict
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Write a result that appears whole or not at all."""
+    write_atomically(path, (json.dumps(content, indent=2) + "\n").encode())
