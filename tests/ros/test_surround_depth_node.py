@@ -246,7 +246,7 @@ def test_an_impossible_camera_info_is_named_and_awaited(spoil, subject, text, gr
     for message in spoiled[info]:
         spoil(message)
     feed = Feed(graph, spoiled)
-    depth = "/surround_depth/front/depth/image_rect"
+    depth = "/surround_depth/left/depth/image_rect"
     graph.subscribe(Image, depth)
     start_and_connect(graph, write_rig(tmp_path, rig_content), feed)
     feed.publish_until(lambda: text in message_of(graph, subject), f"'{text}'")
@@ -266,7 +266,7 @@ def test_an_unknown_encoding_is_named(graph, messages, rig_content, tmp_path):
     rig_content["cameras"][2]["image_topic"] = "/camera/left/image_raw"
     publisher = graph.node.create_publisher(Image, "/camera/left/image_raw", reliable())
     feed = Feed(graph, raw)
-    graph.subscribe(Image, "/surround_depth/front/depth/image_rect")
+    graph.subscribe(Image, "/surround_depth/left/depth/image_rect")
     graph.start_node(rig=write_rig(tmp_path, rig_content), **SMALL)
     graph.await_subscribers(["/camera/left/image_raw"])
 
