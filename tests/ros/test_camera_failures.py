@@ -79,11 +79,13 @@ class Scene:
 
     def __init__(self, graph: RosGraph, rig: Path) -> None:
         self.graph = graph
+        self.trace = rig.parent / "trace.json"
         self.cameras = Cameras(graph)
         graph.subscribe(PointCloud2, CLOUD)
         graph.subscribe(String, CONTENT)
         graph.subscribe(Image, *DEPTH.values())
-        graph.start_node(rig=rig, untrained=True, height=64, width=96, max_age=0.0, min_cameras=4)
+        options = {"max_age": 0.0, "min_cameras": 4, "trace": self.trace}
+        graph.start_node(rig=rig, untrained=True, height=64, width=96, **options)
         graph.await_subscribers([f"/camera/{name}/image_raw/compressed" for name in CAMERAS])
 
     def contained(self) -> list[str]:
@@ -246,3 +248,11 @@ def test_every_published_depth_belongs_to_an_image_of_that_camera_and_stamp(scen
         assert len(stamps) > 10
         assert set(stamps) <= scene.cameras.sent[name]
         assert len(set(stamps)) == len(stamps)
+
+
+def test_the_trace_tells_what_ran_on_which_thread_also_while_the_node_runs(scene):
+    events = json.loads(scene.trace.read_text().rpartition("},")[0] + "}]")
+    threads = {event["tid"]: event["args"]["name"] for event in events if event["name"] == "thread_name"}
+    where = {(event["name"], threads[event["tid"]].partition("_")[0]) for event in events if event["ph"] == "X"}
+    assert {("decode", "prepare"), ("preprocess", "prepare"), ("inference", "inference")} <= where
+    assert {("postprocess", "publish"), ("publish", "publish")} <= where
