@@ -15,7 +15,7 @@ from cvcdepth_ros.settings import MatchingSettings, MissingCameraSettings, Model
 
 AUTO = "auto"
 
-CHANGEABLE_WHILE_RUNNING = ("cloud_stride", "cloud_min_range", "cloud_max_range", "cloud_voxel")
+CHANGEABLE_WHILE_RUNNING = ("checkpoint", "cloud_stride", "cloud_min_range", "cloud_max_range", "cloud_voxel")
 
 
 class NodeParameters(OutputSettings, MissingCameraSettings, MatchingSettings, ModelSettings):

@@ -190,10 +190,21 @@ class SurroundDepthNode(LifecycleNode):  # type: ignore[misc] # rclpy is not ann
         if fixed and self._settings is not None:
             return SetParametersResult(successful=False, reason=f"{', '.join(fixed)}: clean the node up first")
         try:
-            read_parameters(self, changed)
+            parameters = read_parameters(self, changed)
+            if self._settings is not None and any(p.name == "checkpoint" for p in changed):
+                self._replace_model(parameters)
         except CvcDepthError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
+
+    def _replace_model(self, parameters: NodeParameters) -> None:
+        """Load another checkpoint beside the one that runs, and swap them between two sets; the family's errors."""
+        parameters.check_complete()
+        estimator = parameters.build_estimator()
+        if self._session is not None:
+            self._session.set_model(estimator)
+        self._settings, self._estimator = parameters, estimator
+        self.get_logger().info(f"model: {estimator.model_id} on {estimator.device}")
 
 
 def main(args: Sequence[str] | None = None) -> None:

@@ -100,6 +100,14 @@ class SurroundPipeline:
         else:
             self._surround = self._preparer.pool.submit(_surround_estimator, rig, self._estimator, former)
 
+    def set_model(self, estimator: DepthPredictor) -> None:
+        """Use another network from the next set on; its maps are built here, while the former one still runs."""
+        self._estimator = estimator
+        former = self._usable_surround()
+        if former is not None:
+            self._surround = Future()
+            self._surround.set_result(SurroundDepthEstimator(former.rig, estimator, former))
+
     def add(self, camera: str, message: Any) -> None:
         """Take an image message in; quick, for whoever receives them all."""
         stamp = stamp_ns(message)

@@ -72,6 +72,12 @@ class SurroundSession:
         """Subscribe image topics that have appeared."""
         self._inputs.connect()
 
+    def set_model(self, estimator: DepthEstimator) -> None:
+        """Use another network from the next set on."""
+        self._estimator = estimator
+        self._pipeline.set_model(estimator)
+        self._monitored_rig = None  # what was usual for the former network need not be for this one
+
     def close(self) -> bool:
         """Stop everything; False when a thread is still busy with its last set a second later."""
         self._inputs.close()

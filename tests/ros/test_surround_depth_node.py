@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import yaml
 
 pytest.importorskip("rclpy", reason="these tests need a ROS environment")
@@ -22,6 +23,9 @@ from rclpy.serialization import deserialize_message
 from recordings import CAMERAS, JAZZY, sample_entries
 from ros_graph import RosGraph, best_effort, reliable
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
+
+from cvcdepth_core.checkpoint import DepthModelSpec, save_checkpoint
+from cvcdepth_core.networks import DepthNet
 
 SMALL = {"untrained": True, "height": 96, "width": 160, "max_age": 0.0}
 FIRING_ORDER = ("back", "left", "front_left", "front", "front_right", "right")
@@ -373,21 +377,52 @@ def test_a_lifecycle_manager_can_drive_the_node(graph, messages, rig_content, tm
     assert future.result().current_state.label == "unconfigured"
 
 
+def set_parameter(graph: RosGraph, name: str, value: Any) -> Any:
+    client = graph.node.create_client(SetParameters, "/surround_depth/set_parameters")
+    assert client.wait_for_service(20)
+    request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
+    future = client.call_async(request)
+    graph.spin_until(future.done, "the answer")
+    return future.result().results[0]
+
+
 def test_parameters_say_what_they_refuse(graph, rig_content, tmp_path):
     graph.start_node(rig=write_rig(tmp_path, rig_content), **SMALL)
     graph.await_status("node", "active")
-    client = graph.node.create_client(SetParameters, "/surround_depth/set_parameters")
-    assert client.wait_for_service(20)
+    assert set_parameter(graph, "cloud_max_range", 25.0).successful
+    assert "clean the node up first" in set_parameter(graph, "tolerance", 0.2).reason
+    assert "out of range" in set_parameter(graph, "cloud_stride", 1000).reason
 
-    def set_parameter(name: str, value: Any) -> Any:
-        request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
-        future = client.call_async(request)
-        graph.spin_until(future.done, "the answer")
-        return future.result().results[0]
 
-    assert set_parameter("cloud_max_range", 25.0).successful
-    assert "clean the node up first" in set_parameter("tolerance", 0.2).reason
-    assert "out of range" in set_parameter("cloud_stride", 1000).reason
+def small_checkpoint(path: Path, seed: int) -> str:
+    torch.manual_seed(seed)
+    spec = DepthModelSpec(encoder="efficientnet_lite0", height=64, width=96, min_depth=1.0, max_depth=50.0)
+    save_checkpoint(path, spec, DepthNet(spec.encoder).state_dict())
+    return str(path)
+
+
+def test_another_checkpoint_is_loaded_while_running_and_a_bad_one_is_refused(graph, messages, rig_content, tmp_path):
+    first, second = (small_checkpoint(tmp_path / f"{seed}.safetensors", seed) for seed in (1, 2))
+    damaged = tmp_path / "damaged.safetensors"
+    damaged.write_bytes(b"\xff" * 64)
+    topic = "/surround_depth/front/depth/image_rect"
+    feed = Feed(graph, messages)
+    graph.subscribe(Image, topic)
+    graph.start_node(rig=write_rig(tmp_path, rig_content), checkpoint=first, max_age=0.0)
+    graph.await_subscribers([f"/camera/{name}/image_raw/compressed" for name in CAMERAS])
+    feed.publish_until(lambda: graph.received[topic], "depth of the first network")
+
+    refused = set_parameter(graph, "checkpoint", str(damaged))
+    assert not refused.successful
+    assert "is damaged or not a safetensors file" in refused.reason
+    assert "1.safetensors" in graph.await_status("model", "safetensors").message
+
+    assert set_parameter(graph, "checkpoint", second).successful
+    graph.await_status("model", "2.safetensors")
+    former = bytes(graph.received[topic][0].data)
+    graph.received[topic].clear()
+    feed.publish_until(lambda: graph.received[topic], "depth of the second network")
+    assert bytes(graph.received[topic][-1].data) != former
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
