@@ -7,6 +7,7 @@ import math
 import sys
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin
 
 from pydantic import ValidationError
@@ -114,6 +115,14 @@ def print_result(result: dict[str, Any], text: str, as_json: bool) -> None:
 def warn(text: str) -> None:
     """Tell something on stderr that does not end the command."""
     print(f"warning: {text}", file=sys.stderr)
+
+
+def can_draw(page: str) -> bool:
+    """Say whether a page can be made, and warn where it cannot; to be asked before the work begins."""
+    missing = [name for name in ("jinja2", "matplotlib") if find_spec(name) is None]
+    if missing:
+        warn(f"no {page}: {' and '.join(missing)} not installed; pip install 'cvcdepth_ros[report]' brings it")
+    return not missing
 
 
 @contextmanager

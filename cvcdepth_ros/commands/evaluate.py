@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +17,7 @@ from cvcdepth_ros.commands.arguments import (
     add_recordings,
     add_settings,
     add_window,
+    can_draw,
     print_result,
     settings_from,
     table,
@@ -134,7 +134,7 @@ def _evaluated(
 
     if settings.notice:
         warn(settings.notice)
-    with_report = not arguments.no_report and _is_drawable()
+    with_report = not arguments.no_report and can_draw(_REPORT_FILE)
     jobs = _jobs(arguments, settings)
     result = _result(arguments, settings, jobs, folder)
     content = result.to_json()
@@ -146,14 +146,6 @@ def _evaluated(
 
         write_report(folder / _REPORT_FILE, result, {job.name: job for job in jobs})
     return folder, {name: value for name, value in content.items() if name != "rows"}, _text(result, folder)
-
-
-def _is_drawable() -> bool:
-    """Say, and tell before the work begins, whether the page can be made."""
-    missing = [name for name in ("jinja2", "matplotlib") if find_spec(name) is None]
-    if missing:
-        warn(f"no {_REPORT_FILE}: {' and '.join(missing)} not installed; pip install 'cvcdepth_ros[report]' brings it")
-    return not missing
 
 
 def _result(

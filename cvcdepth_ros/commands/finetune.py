@@ -2,7 +2,6 @@
 """`finetune`: train a checkpoint further on recordings of one's own vehicle, without labels."""
 
 import argparse
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +11,7 @@ from cvcdepth_ros.commands.arguments import (
     add_quiet,
     add_recordings,
     add_skip,
+    can_draw,
     print_result,
     refuse_unknown_checks,
     table,
@@ -62,10 +62,11 @@ def execute(arguments: argparse.Namespace) -> None:
 
     refuse_unknown_checks(arguments)
     with launched_processes() as processes:
+        with_report = processes.is_first and can_draw(_REPORT_FILE)
         tuned = _fine_tuned(arguments, processes)
     if tuned is None:
         return
-    result = _written(tuned)
+    result = _written(tuned, with_report)
     print_result(result, _text(result), arguments.json)
     if not tuned.verdict.promoted:
         raise NotPromotedError(f"{arguments.output / BEST_FILE} is not written: {tuned.verdict.reason}")
@@ -76,10 +77,8 @@ def _fine_tuned(arguments: argparse.Namespace, processes: "Processes") -> "FineT
     from cvcdepth_ros.finetuning.run import fine_tune
 
     order = _order(arguments)
-    if processes.is_first:
-        for missing, text in ((not has_tensorboard(), WITHOUT_TENSORBOARD), (not _is_drawable(), _WITHOUT_REPORT)):
-            if missing:
-                warn(text)
+    if processes.is_first and not has_tensorboard():
+        warn(WITHOUT_TENSORBOARD)
     try:
         return fine_tune(order, processes, warn)
     except KeyboardInterrupt:
@@ -110,23 +109,14 @@ def _order(arguments: argparse.Namespace) -> "Order":
     return Order(source, config, arguments.output, start, arguments.device, arguments.quiet)
 
 
-_WITHOUT_REPORT = (
-    f"no {_REPORT_FILE}: jinja2 or matplotlib is not installed; pip install 'cvcdepth_ros[report]' brings them"
-)
-
-
-def _is_drawable() -> bool:
-    return all(find_spec(name) is not None for name in ("jinja2", "matplotlib"))
-
-
-def _written(tuned: "FineTuned") -> dict[str, Any]:
-    """Write the card, the page and the result; return the result."""
+def _written(tuned: "FineTuned", with_report: bool) -> dict[str, Any]:
+    """Write the card, the page if wanted, and the result; return the result."""
     from cvcdepth_ros.finetuning.card import model_card, write_card
     from cvcdepth_ros.finetuning.run import write_json
 
     run, card = tuned.order.run, model_card(tuned)
     write_card(run, card)
-    if _is_drawable():
+    if with_report:
         from cvcdepth_ros.finetuning.page import write_report
 
         write_report(run / _REPORT_FILE, tuned, card)
