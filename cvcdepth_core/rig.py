@@ -273,7 +273,7 @@ def load_rig_layout(path: Path) -> RigLayout:
     """Read a rig file. RigError names the file, the field and the value that is wrong."""
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise RigError(f"rig file {path}: cannot be read: {reason}") from error
     try:

@@ -192,7 +192,7 @@ class Recording:
         try:
             names = yaml.safe_load(metadata.read_text())["rosbag2_bagfile_information"]["relative_file_paths"]
             return [folder / PurePath(name).name for name in names]
-        except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError) as error:
+        except (yaml.YAMLError, ValueError, KeyError, TypeError, RecursionError) as error:
             self._damage.append(f"{metadata}: unreadable ({type(error).__name__}), reading all files of the folder")
             return []
 
