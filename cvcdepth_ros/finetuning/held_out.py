@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
+from tqdm import tqdm
 
 from cvcdepth_core.training_config import TrainingConfig
 from cvcdepth_ros.bags import open_recording
@@ -19,6 +20,7 @@ from cvcdepth_ros.synchronizer import NANOSECONDS
 from cvcdepth_ros.training_index import RecordingIndex
 from cvcdepth_ros.training_samples import split_stamp
 
+_BAR = "{desc}: {percentage:3.0f}%|{bar}| {n:.1f} of {total} recordings [{elapsed}<{remaining}]"
 _FEWEST_SETS = 2  # the scores along the way need two
 
 
@@ -85,18 +87,20 @@ def some_sets(parts: Sequence[HeldOutPart], most: int) -> list[EvaluationJob]:
 
 
 def evaluate(
-    jobs: Sequence[EvaluationJob],
-    checkpoint: Path,
-    folder: Path | None = None,
-    progress: Callable[[float], None] | None = None,
+    jobs: Sequence[EvaluationJob], checkpoint: Path, folder: Path | None = None, label: str | None = None
 ) -> EvaluationResult:
     """Score a checkpoint file; what `folder` holds of the very same work is not done again.
 
-    `progress` is told how many jobs are done. Raises RecordingError when no recording can be evaluated.
+    With a `label` there is a progress bar on terminals. Raises RecordingError when no recording can be evaluated.
     """
     settings = jobs[0].settings.model_copy(update={"checkpoint": str(checkpoint)})
     ready = [replace(job, settings=settings) for job in jobs]
     depends_on = settings.dependencies()
     kept = None if folder is None else KeptParts(folder, depends_on)
-    outcomes = [outcome for _, outcome in evaluate_all(ready, kept=kept, progress=progress)]
+    with tqdm(total=len(jobs), desc=label, disable=None if label else True, bar_format=_BAR, leave=False) as bar:
+
+        def show(done: float) -> None:
+            bar.update(done - bar.n)
+
+        outcomes = [outcome for _, outcome in evaluate_all(ready, kept=kept, progress=show)]
     return EvaluationResult.of(ready, outcomes, depends_on)

@@ -63,7 +63,7 @@ def prepare(source: Source, run: Path) -> Prepared:
             _refuse(path, problems)
             prepared.indexes.append(load_index(path, run / _INDEX_FOLDER, source.matching, source.layout))
             prepared.warnings += [_told(path, problem) for problem in problems]
-        except CvcDepthError as error:
+        except (CvcDepthError, OSError) as error:
             prepared.left_out[str(path)] = str(error)
     if not prepared.indexes:
         raise RecordingError("; ".join(prepared.left_out.values()))

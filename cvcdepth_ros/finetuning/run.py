@@ -95,7 +95,7 @@ def fine_tune(order: Order, processes: Processes, tell: Tell) -> FineTuned | Non
             observer.close()
     if not processes.is_first:
         return None
-    weights, after, verdict = _judged(order.run, parts, before)
+    weights, after, verdict = _judged(order, parts, before)
     samples = [sum(sample.recording == i for sample in batches.reader.samples) for i in range(len(prepared.indexes))]
     return FineTuned(order, prepared, trainer, samples, parts, weights, before, after, verdict)
 
@@ -140,20 +140,26 @@ def _scores_of_start(order: Order, model: SurroundModel, parts: list[HeldOutPart
     found = load_checkpoint(path).metadata.get(_START_KEY)
     if found != order.started_from:
         raise CheckpointError(f"{order.run}: its run started from {found}, now it is {order.started_from}")
-    return evaluate([part.job for part in parts], path, order.run / _SCORES_FOLDER / "before")
+    return _scored(order, parts, path, "before")
+
+
+def _scored(order: Order, parts: list[HeldOutPart], weights: Path, when: str) -> EvaluationResult:
+    label = None if order.quiet else f"held-out part, {when}"
+    return evaluate([part.job for part in parts], weights, order.run / _SCORES_FOLDER / when, label)
 
 
 def _judged(
-    run: Path, parts: list[HeldOutPart], before: EvaluationResult | None
+    order: Order, parts: list[HeldOutPart], before: EvaluationResult | None
 ) -> tuple[Path, EvaluationResult | None, Verdict]:
     """Score the candidate, compare it with the start, and promote it or not."""
+    run = order.run
     best, candidate = run / BEST_FILE, run / CANDIDATE_FILE
     if before is None:
         best.unlink(missing_ok=True)
         reason = "nothing was proven: no recording has a held-out part (recordings.held_out)"
         return run / CHECKPOINT_FILE, None, Verdict(False, reason)
     weights = candidate if candidate.exists() else run / CHECKPOINT_FILE
-    after = evaluate([part.job for part in parts], weights, run / _SCORES_FOLDER / "after")
+    after = _scored(order, parts, weights, "after")
     verdict = judge(before, after)
     if verdict.promoted:
         write_atomically(best, weights.read_bytes())
