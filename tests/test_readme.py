@@ -38,7 +38,7 @@ def test_every_link_to_a_file_leads_somewhere():
 
 def test_cvcdepth_commands_run_in_the_order_in_which_they_stand(tmp_path):
     (tmp_path / "samples").symlink_to(ROOT / "samples")
-    commands = [command for command in COMMANDS if command.startswith("cvcdepth ")]
+    commands = [command for command in COMMANDS if command.startswith("cvcdepth ") and "drives/" not in command]
     assert {shlex.split(command)[1] for command in commands} == {"inspect", "check", "rig", "run", "evaluate", "play"}
     for command in commands:
         if " play " in command:
@@ -46,6 +46,20 @@ def test_cvcdepth_commands_run_in_the_order_in_which_they_stand(tmp_path):
         words = [sys.executable, "-m", "cvcdepth_ros.bag_replay", *shlex.split(command)[1:]]
         done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=100)
         assert done.returncode == 0, f"{command}\n{done.stderr}"
+
+
+@pytest.mark.parametrize("command", [command for command in COMMANDS if "drives/" in command])
+def test_commands_for_the_users_own_drives_have_only_options_that_there_are(command):
+    """test_bag_finetune.py runs them, on the sample and at a small size."""
+    program, subcommand, *words = shlex.split(command)
+    done = subprocess.run(
+        [sys.executable, "-m", "cvcdepth_ros.bag_replay", subcommand, "--help"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert {word for word in words if word.startswith("-")} <= set(re.findall(r"--?[a-z-]+", done.stdout))
+    assert all((ROOT / word).is_file() for word in words if word.startswith("config/"))
 
 
 @pytest.mark.parametrize("command", [command for command in COMMANDS if not command.startswith("cvcdepth ")])
@@ -60,5 +74,8 @@ def test_other_commands_name_what_exists(command):
         launch_file = (ROOT / "launch" / words[3]).read_text()
         given = {word.split(":=")[0] for word in words[4:]}
         assert given <= set(re.findall(r'DeclareLaunchArgument\("(\w+)"', launch_file))
+    elif words[:2] == ["ros2", "param"]:
+        assert words[2:5] == ["set", "/surround_depth", "checkpoint"]
+        assert f"    {words[4]}:" in (ROOT / "config" / "surround_depth.yaml").read_text()
     else:
         assert command.startswith(RUN_ELSEWHERE), f"no test runs or checks: {command}"

@@ -43,7 +43,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="RUN", help="the run's folder")
     parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="training configuration (YAML)")
     start = parser.add_mutually_exclusive_group(required=True)
-    start.add_argument("--from", dest="start", type=Path, metavar="CHECKPOINT", help="weights to start from")
+    start.add_argument(
+        "--from", dest="start", metavar="CHECKPOINT", help="weights to start from; 'default' are the package's own"
+    )
     start.add_argument("--from-scratch", action="store_true", help="start from random weights")
     parser.add_argument("--rig", type=Path, metavar="FILE", help="rig file [the cameras found in each recording]")
     parser.add_argument(
@@ -88,6 +90,7 @@ def _fine_tuned(arguments: argparse.Namespace, processes: "Processes") -> "FineT
 
 def _order(arguments: argparse.Namespace) -> "Order":
     from cvcdepth_core.checkpoint import load_checkpoint
+    from cvcdepth_core.default_model import checkpoint_path
     from cvcdepth_core.rig import load_rig_layout
     from cvcdepth_core.training_config import load_training_config
     from cvcdepth_ros.bags import find_recordings
@@ -105,7 +108,7 @@ def _order(arguments: argparse.Namespace) -> "Order":
         tuple(arguments.skip),
         not arguments.no_masks,
     )
-    start = None if arguments.start is None else load_checkpoint(arguments.start)
+    start = None if arguments.start is None else load_checkpoint(checkpoint_path(arguments.start))
     return Order(source, config, arguments.output, start, arguments.device, arguments.quiet)
 
 
