@@ -51,7 +51,7 @@ def test_cvcdepth_commands_run_in_the_order_in_which_they_stand(tmp_path):
 @pytest.mark.parametrize("command", [command for command in COMMANDS if "drives/" in command])
 def test_commands_for_the_users_own_drives_have_only_options_that_there_are(command):
     """test_bag_finetune.py runs them, on the sample and at a small size."""
-    program, subcommand, *words = shlex.split(command)
+    _, subcommand, *words = shlex.split(command)
     done = subprocess.run(
         [sys.executable, "-m", "cvcdepth_ros.bag_replay", subcommand, "--help"],
         capture_output=True,
