@@ -1,16 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cost of the synchroniser for eight cameras at 60 Hz, as one line of JSON: `python benchmarks/synchronizer.py`.
+"""Cost of the synchroniser for eight cameras at 60 Hz: `python benchmarks/synchronizer.py`.
 
 The baseline is what a plain approximate-time matcher does: on every arrival try the combinations of queued images, the
 nearest first, until one fits the tolerance. Both get the same stream in the same run.
 """
 
 import itertools
-import json
-import platform
 import random
-import time
-from collections.abc import Callable
+
+from measuring import json_lines, measure_in_turns, print_line
 
 from cvcdepth_ros.synchronizer import NANOSECONDS, SurroundSynchronizer
 
@@ -21,7 +19,6 @@ SECONDS = 60
 REPEATS = 5
 
 Stream = list[tuple[str, int]]
-Add = Callable[[str, int, None], object]
 
 
 class ApproximateTimeScan:
@@ -65,42 +62,29 @@ def eight_cameras() -> Stream:
     return sorted(stream, key=lambda arrival: arrival[1])
 
 
-def microseconds_per_image(add: Add, stream: Stream) -> float:
-    start = time.perf_counter()
+def run(matcher: SurroundSynchronizer[None] | ApproximateTimeScan, stream: Stream) -> None:
     for camera, stamp in stream:
-        add(camera, stamp, None)
-    return (time.perf_counter() - start) / len(stream) * 1e6
+        matcher.add(camera, stamp, None)
 
 
-def synchronizer() -> SurroundSynchronizer[None]:
-    return SurroundSynchronizer(CAMERAS, CAMERAS[0], TOLERANCE)
+def synchronizer(min_cameras: int = 0) -> SurroundSynchronizer[None]:
+    return SurroundSynchronizer(CAMERAS, CAMERAS[0], TOLERANCE, min_cameras=min_cameras)
 
 
 def main() -> None:
     stream = eight_cameras()
     one_dead = [arrival for arrival in stream if arrival[0] != CAMERAS[-1]]
-    check, scan = synchronizer(), ApproximateTimeScan()
-    microseconds_per_image(check.add, stream)
-    microseconds_per_image(scan.add, stream)
-    ours = min(microseconds_per_image(synchronizer().add, stream) for _ in range(REPEATS))
-    ours_one_dead = min(microseconds_per_image(synchronizer().add, one_dead) for _ in range(REPEATS))
-    baseline = min(microseconds_per_image(ApproximateTimeScan().add, stream) for _ in range(REPEATS))
-    figures = {
-        "benchmark": "synchronizer",
-        "machine": f"{platform.machine()} {platform.system()} {platform.processor()}".strip(),
-        "python": platform.python_version(),
-        "cameras": len(CAMERAS),
-        "rate_hz": RATE,
-        "images": len(stream),
-        "sets": check.statistics().sets,
-        "us_per_image": round(ours, 2),
-        "core_share_percent": round(ours * len(CAMERAS) * RATE / 1e4, 3),
-        "one_dead_camera_us_per_image": round(ours_one_dead, 2),
-        "baseline_sets": scan.sets,
-        "baseline_us_per_image": round(baseline, 2),
-        "ratio_to_baseline": round(ours / baseline, 2),
+    cases = {
+        "first combination that fits": lambda: run(ApproximateTimeScan(), stream),
+        "ours": lambda: run(synchronizer(), stream),
+        "ours, one camera dead": lambda: run(synchronizer(), one_dead),
+        "ours, one camera dead, min_cameras 6": lambda: run(synchronizer(min_cameras=6), one_dead),
     }
-    print(json.dumps(figures))
+    timings = measure_in_turns(cases, REPEATS)
+    sizes = {"cameras": len(CAMERAS), "rate_hz": RATE, "stream_s": SECONDS}
+    for line in json_lines("synchronizer", timings, "first combination that fits", sizes):
+        share = line["cpu_ms"] / (1e3 * SECONDS)
+        print_line(line | {"core_share_percent": round(100 * share, 3)})
 
 
 if __name__ == "__main__":
