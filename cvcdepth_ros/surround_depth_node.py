@@ -58,6 +58,7 @@ class SurroundDepthNode(LifecycleNode):  # type: ignore[misc] # rclpy is not ann
         self._session: SurroundSession | None = None
         self._failure = ""
         self._reported: dict[str, CameraCondition] = {}
+        self._refused = 0
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         # Steady time: with use_sim_time and no /clock yet, these must run all the same.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -149,7 +150,7 @@ class SurroundDepthNode(LifecycleNode):  # type: ignore[misc] # rclpy is not ann
         if self._session is not None:
             self._session.poll()
             self._report(self._session.conditions())
-            self._report_refusals(self._session.problem)
+            self._report_refusals(self._session.refused, self._session.problem)
 
     def _report(self, conditions: dict[str, CameraCondition]) -> None:
         """Log what is wrong with each camera once, when it begins, and its end."""
@@ -161,9 +162,10 @@ class SurroundDepthNode(LifecycleNode):  # type: ignore[misc] # rclpy is not ann
                     self.get_logger().warning(f"camera {camera}: {condition.text}")
         self._reported = conditions
 
-    def _report_refusals(self, reason: str) -> None:
-        if reason:
+    def _report_refusals(self, count: int, reason: str) -> None:
+        if count > self._refused and reason:
             self.get_logger().error(f"set refused: {reason}", throttle_duration_sec=5.0)
+        self._refused = count
 
     def _publish_diagnostics(self) -> None:
         statuses = [self._node_status(), *(self._session.diagnostics() if self._session else [])]

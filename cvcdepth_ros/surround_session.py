@@ -106,6 +106,11 @@ class SurroundSession:
         """Why the last set was refused; empty when it was not."""
         return self._pipeline.problem
 
+    @property
+    def refused(self) -> int:
+        """Sets that were refused so far."""
+        return self._pipeline.counters["refused"]
+
     def diagnostics(self) -> list[DiagnosticStatus]:
         """Describe cameras, synchronisation, inference and model."""
         statistics, mailbox = self._synchroniser.statistics(), self._mailbox.statistics()
