@@ -53,6 +53,18 @@ test-core: $(CORE) ## all other tests, in an environment without ROS
 	@if .venv-core/bin/python -c 'import rclpy' 2>/dev/null; then echo "rclpy is in .venv-core: make clean"; exit 1; fi
 	.venv-core/bin/python -m pytest $(BESIDE) --ignore tests/ros
 
+test-faults: $(DEV) ## inject every fault into node and tool; the table of reactions in output/faults.md
+	@mkdir -p output && rm -f output/faults.md
+	.venv/bin/python -m pytest tests/faults --all-faults --fault-table output/faults.md
+
+fuzz: $(DEV) ## fuzz everything that reads foreign bytes (SECONDS=60 for each target); findings in fuzz/findings
+	.venv/bin/pip install -qq --only-binary :all: atheris==3.0.0
+	for target in compressed_images raw_images messages recordings metadata rig_files; do \
+	  .venv/bin/python fuzz/run.py $$target --seconds $(or $(SECONDS),60) --corpus fuzz/found/$$target || exit 1; done
+
+soak: $(DEV) ## feed the node with faults for MINUTES=60 and watch memory, files and threads
+	.venv/bin/python tools/soak.py --minutes $(or $(MINUTES),60) --output output/soak.json
+
 tf2_msgs: $(DEV) ## build tf2_msgs, which has no wheel, for the tests of /tf_static (needs g++)
 	@test -e $(TF2) || .venv/bin/python tests/tf2_msgs/build.py $(TF2)
 

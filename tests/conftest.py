@@ -24,6 +24,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         default=Path(__file__).parent / "golden",
         help="where test_golden.py finds the published program's arrays",
     )
+    parser.addoption("--all-faults", action="store_true", help="inject all faults into the node, not only every fifth")
+    parser.addoption("--fault-table", type=Path, help="where the tests of faults write what they measured")
 
 
 @pytest.fixture(scope="module")
