@@ -184,10 +184,16 @@ class DepthReplay:
         self._surround = SurroundDepthEstimator(replay.rig, estimator)
 
     def sets(
-        self, start: int | None = None, stop: int | None = None, handlers: Handlers | None = None
+        self,
+        start: int | None = None,
+        stop: int | None = None,
+        handlers: Handlers | None = None,
+        stamp_ns: int | None = None,
     ) -> Iterator[EstimatedSet]:
-        """Give the sets of `SurroundReplay.sets` with their depth."""
+        """Give the sets of `SurroundReplay.sets` with their depth; with a stamp, the set of that stamp only."""
         for images in self._replay.sets(start, stop, handlers):
+            if stamp_ns not in (None, images.stamp_ns):
+                continue
             try:
                 surround = self._current_surround()
                 messages = {name: image.message for name, image in images.images.items()}

@@ -127,12 +127,12 @@ class RecordingEvaluation:
         end = self.replay.recording.end + 1
         return start, end if self.job.duration is None else min(end, start + round(self.job.duration * NANOSECONDS))
 
-    def sets(self, start: int, stop: int) -> Iterator[MeasuredSet]:
-        """Give the sets of start <= log_time < stop (ns), in order."""
+    def sets(self, start: int, stop: int, stamp_ns: int | None = None) -> Iterator[MeasuredSet]:
+        """Give the sets of start <= log_time < stop (ns), in order; with a stamp, the set of that stamp only."""
         ahead = self.truth.ahead_ns
         self.truth.read(start - ahead, start)
         pending: deque[EstimatedSet] = deque()
-        for estimated in self.depths.sets(start, stop, self.truth.handlers):
+        for estimated in self.depths.sets(start, stop, self.truth.handlers, stamp_ns):
             pending.append(estimated)
             while _log_time(pending[0]) + ahead < _log_time(estimated):
                 yield self._measured(pending.popleft())
@@ -191,9 +191,8 @@ def evaluate_recording(job: EvaluationJob, progress: Progress | None = None) -> 
 def measured_set(job: EvaluationJob, stamp_ns: int, log_time: int) -> MeasuredSet:
     """Measure one set again, which is known by its stamp and log time (ns); RecordingError when it is not there."""
     with open_evaluation(job) as evaluation:
-        for measured in evaluation.sets(log_time - 2 * NANOSECONDS, log_time + NANOSECONDS):
-            if measured.stamp_ns == stamp_ns:
-                return measured
+        for measured in evaluation.sets(log_time - 2 * NANOSECONDS, log_time + NANOSECONDS, stamp_ns):
+            return measured
     raise RecordingError(f"{job.path}: no set at {stamp_ns} ns")
 
 
