@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Six pictures in, six depth maps out, by every engine that is installed: time, memory, and how far the depth is off.
+
+    python benchmarks/estimator.py [--rounds 10] [--threads 1] [--device cuda] [--networks efficientnet_lite0:192x320]
+
+Each engine has a process of its own, whose peak memory it is, and they take turns. The baseline is ResNet-18 at
+6 x 384 x 640 as torch runs it: all cameras as one batch, operation by operation, float32. `times_eager` compares with
+the same for the same network and size. Weights are random: they change nothing about the speed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+import time
+from collections.abc import Callable, Iterator
+from multiprocessing.connection import Connection
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from measuring import Timings, json_lines, peak_memory_mb, print_line, times_quicker
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from cvcdepth_core.checkpoint import DepthModelSpec
+    from cvcdepth_core.images import Picture
+    from cvcdepth_core.networks import DepthNet
+
+CAMERAS = 6
+BASELINE = ("torch eager batch", "resnet18", 384, 640)
+CPU_BACKENDS = ("torch_eager", "torch", "ncnn", "onnxruntime")
+CUDA_BACKENDS = ("torch_eager", "torch", "torch_compiled", "onnxruntime", "tensorrt")
+
+Case = tuple[str, str, int, int]
+"""Engine (with its precision), encoder, height, width."""
+Depth = NDArray[np.float32]
+
+
+def main() -> None:
+    options = parse_options()
+    os.environ["OMP_NUM_THREADS"] = str(options.threads)
+    for network in options.networks:
+        for line in measured(network, options):
+            print_line(line)
+
+
+def parse_options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=10)
+    parser.add_argument("--threads", type=int, default=len(os.sched_getaffinity(0)))
+    parser.add_argument("--device", default="cpu", help="cpu or cuda")
+    parser.add_argument(
+        "--networks",
+        type=network_of,
+        nargs="+",
+        default=[("resnet18", 384, 640), ("resnet34", 384, 640), ("efficientnet_lite0", 192, 320)],
+        metavar="ENCODER:HxW",
+    )
+    return parser.parse_args()
+
+
+def network_of(text: str) -> tuple[str, int, int]:
+    encoder, _, size = text.partition(":")
+    height, _, width = size.partition("x")
+    return encoder, int(height), int(width)
+
+
+def measured(network: tuple[str, int, int], options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """Let the baseline and all engines of one network take turns."""
+    eager: Case = (BASELINE[0], *network)
+    cases = list(dict.fromkeys([BASELINE, eager, *((engine, *network) for engine in engines(options.device))]))
+    workers = {case: Worker(case, options) for case in cases}
+    depths = {case: worker.ask() for case, worker in workers.items()}
+    timings = {case: Timings() for case in cases}
+    for _ in range(options.rounds):
+        for case, worker in workers.items():
+            wall, cpu = worker.ask()
+            timings[case].wall.append(wall)
+            timings[case].cpu.append(cpu)
+    memory = {case: worker.ask(finish=True) for case, worker in workers.items()}
+    names = {case: " ".join(map(str, case)) for case in cases}
+    lines = json_lines("estimator", {names[case]: timings[case] for case in cases}, names[BASELINE], {}, options.device)
+    for case, line in zip(cases, lines, strict=True):
+        if case[1:] == network:
+            own = {"case": case[0], "encoder": case[1], "cameras": CAMERAS, "size": f"{case[3]} x {case[2]}"}
+            yield (
+                line
+                | own
+                | {
+                    "times_eager": round(times_quicker(timings[eager].wall, timings[case].wall), 3),
+                    "times_eager_cpu": round(times_quicker(timings[eager].cpu, timings[case].cpu), 3),
+                    "relative_depth_difference_p99.9": float(f"{difference(depths[case], depths[eager]):.2g}"),
+                    "peak_memory_mb": round(memory[case]),
+                }
+            )
+
+
+def engines(device: str) -> list[str]:
+    """Name the engines that are installed, and on a GPU each precision."""
+    from cvcdepth_core.engines import is_installed
+
+    if device == "cpu":
+        return [name for name in CPU_BACKENDS if is_installed(name)]
+    half = [f"{name} bfloat16" for name in ("torch", "torch_compiled")]
+    return [*(name for name in CUDA_BACKENDS if is_installed(name)), *half]
+
+
+def difference(depth: Depth, exact: Depth) -> float:
+    return float(np.quantile(np.abs(depth / exact - 1), 0.999))
+
+
+class Worker:
+    """One engine in a process of its own."""
+
+    def __init__(self, case: Case, options: argparse.Namespace) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._connection, theirs = context.Pipe()
+        arguments = (theirs, case, options.device, options.threads)
+        self._process = context.Process(target=work, args=arguments, daemon=True)
+        self._process.start()
+        theirs.close()
+
+    def ask(self, finish: bool = False) -> Any:
+        """Return the depth the first time, then seconds of wall and CPU time, and in the end the peak memory in MiB."""
+        self._connection.send(finish)
+        answer = self._connection.recv()
+        if finish:
+            self._process.join()
+        return answer
+
+
+def work(connection: Connection, case: Case, device: str, threads: int) -> None:
+    """Answer what `Worker.ask` asks."""
+    import torch
+
+    torch.set_num_threads(threads)
+    estimate = estimate_of(case, device)
+    connection.recv()
+    connection.send(estimate())
+    while not connection.recv():
+        wall, cpu = time.perf_counter(), time.process_time()
+        estimate()
+        connection.send((time.perf_counter() - wall, time.process_time() - cpu))
+    connection.send(peak_memory_mb(device))
+
+
+def estimate_of(case: Case, device: str) -> Callable[[], Depth]:
+    """Return what is measured; pictures and weights are the same for every engine of a network."""
+    from cvcdepth_core.checkpoint import DepthModelSpec
+    from cvcdepth_core.engines.parity import street_like_picture
+    from cvcdepth_core.estimator import DepthEstimator, untrained_network
+
+    engine, encoder, height, width = case
+    spec = DepthModelSpec(encoder=encoder, height=height, width=width, min_depth=0.5, max_depth=100.0)
+    pictures = [np.roll(street_like_picture(height, width), 17 * camera, axis=1) for camera in range(CAMERAS)]
+    fx = np.full(CAMERAS, 0.5 * width)
+    network = untrained_network(encoder)
+    if engine == BASELINE[0]:
+        return straightforward(network, spec, pictures, fx, device)
+    backend, _, precision = engine.partition(" ")
+    estimator = DepthEstimator(network, spec, "random", device, backend, precision or "float32")  # type: ignore[arg-type]
+    return lambda: estimator.estimate(pictures, fx)
+
+
+def straightforward(
+    network: DepthNet, spec: DepthModelSpec, pictures: list[Picture], fx: NDArray[np.float64], device: str
+) -> Callable[[], Depth]:
+    """Return the pipeline that anyone would write first: one batch through the network."""
+    import torch
+
+    from cvcdepth_core.networks import disparity_to_depth
+    from cvcdepth_core.preprocess import to_tensor
+
+    network.eval().to(device)
+    focal_lengths = torch.as_tensor(fx, dtype=torch.float32, device=device)
+
+    @torch.inference_mode()
+    def estimate() -> Depth:
+        disparity = network(to_tensor(pictures, device))
+        depth = disparity_to_depth(disparity, focal_lengths, spec.min_depth, spec.max_depth, spec.focal_scale)
+        return depth[:, 0].cpu().numpy()  # type: ignore[no-any-return]
+
+    return estimate
+
+
+if __name__ == "__main__":
+    main()
