@@ -55,7 +55,7 @@ test-core: $(CORE) ## all other tests, in an environment without ROS
 
 test-faults: $(DEV) ## inject every fault into node and tool; the table of reactions in output/faults.md
 	@mkdir -p output && rm -f output/faults.md
-	.venv/bin/python -m pytest tests/faults --all-faults --fault-table output/faults.md
+	.venv/bin/python -m pytest tests/faults tests/ros/test_node_faults.py --all-faults --fault-table output/faults.md
 
 fuzz: $(DEV) ## fuzz everything that reads foreign bytes (SECONDS=60 for each target); findings in fuzz/findings
 	.venv/bin/pip install -qq --only-binary :all: atheris==3.0.0

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from faults.table import FaultTable
 from s3_server import LocalS3, local_s3
 
 # A shell that runs the tests in the background has them ignore SIGINT, and the programs they start would inherit that.
@@ -26,6 +27,16 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
     parser.addoption("--all-faults", action="store_true", help="inject all faults into the node, not only every fifth")
     parser.addoption("--fault-table", type=Path, help="where the tests of faults write what they measured")
+
+
+@pytest.fixture(scope="module")
+def fault_table(request: pytest.FixtureRequest) -> Iterator[FaultTable]:
+    """Collects the reactions to faults; with --fault-table FILE they are appended to it."""
+    table = FaultTable()
+    yield table
+    path = request.config.getoption("--fault-table")
+    if path is not None:
+        table.write(path)
 
 
 @pytest.fixture(scope="module")

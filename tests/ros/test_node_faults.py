@@ -15,6 +15,7 @@ import pytest
 pytest.importorskip("rclpy", reason="these tests need a ROS environment")
 
 import recordings
+from faults.table import FaultTable
 from recordings import CAMERAS
 from ros_graph import RosGraph
 from test_camera_failures import DEPTH, Scene, silent, stamp_of
@@ -22,7 +23,6 @@ from test_camera_failures import DEPTH, Scene, silent, stamp_of
 from cvcdepth_core.rig import save_rig_layout
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.recorded_rig import discover_rig
-from faults.table import FaultTable
 
 LEFT_OUT = [name for name in CAMERAS if name != "left"]
 

@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Feed the node at 10 Hz for minutes or hours, with random faults every few seconds, and watch what it keeps.
+
+    python tools/soak.py --minutes 60 --output output/soak.json
+
+The faults are those of tests/ros/test_node_faults.py, each for some seconds, in an order that `--seed` decides. The run
+fails when the node ends, when its memory after the warm-up grows by more than 2 %, when its files or threads become
+more, or when a depth image carries a stamp that its camera has not sent, or one twice.
+"""
+
+import argparse
+import copy
+import json
+import random
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "tests" / "ros")]
+
+import recordings  # noqa: E402
+from recordings import CAMERAS  # noqa: E402
+from ros_graph import RosGraph  # noqa: E402
+from test_camera_failures import DEPTH, Scene, stamp_of  # noqa: E402
+from test_node_faults import FAULTS  # noqa: E402
+
+from cvcdepth_core.rig import save_rig_layout  # noqa: E402
+from cvcdepth_ros.bags import open_recording  # noqa: E402
+from cvcdepth_ros.recorded_rig import discover_rig  # noqa: E402
+
+GROWTH = 0.02
+PERIOD = 0.1
+KEPT_STAMPS = 1000
+
+
+@dataclass
+class Soak:
+    """What was seen so far."""
+
+    seed: int
+    seconds: float = 0.0
+    sets_sent: int = 0
+    depth_images: int = 0
+    faults: Counter[str] = field(default_factory=Counter)
+    wrong_stamps: list[str] = field(default_factory=list)
+    samples: list[tuple[float, float, int, int]] = field(default_factory=list)
+    """Seconds, resident MiB, open files, threads."""
+
+    def problems(self, warm_up: float) -> list[str]:
+        """Say what must not be."""
+        settled = [sample for sample in self.samples if sample[0] >= warm_up]
+        if len(settled) < 2 * _QUARTER:
+            return [f"only {len(settled)} measurements after the warm-up of {warm_up:.0f} s"]
+        first, last = settled[: len(settled) // _QUARTER], settled[-len(settled) // _QUARTER :]
+        growth = _median([s[1] for s in last]) / _median([s[1] for s in first]) - 1
+        found = list(self.wrong_stamps[:5])
+        if growth > GROWTH:
+            found.append(f"resident memory grew by {growth:.1%}")
+        for index, name in ((2, "open files"), (3, "threads")):
+            before, after = _median([s[index] for s in first]), _median([s[index] for s in last])
+            if after > before:
+                found.append(f"{name} grew from {before:.0f} to {after:.0f}")
+        return found if self.depth_images else [*found, "no depth image was published"]
+
+
+_QUARTER = 4
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run, write the result, and return 1 when something was wrong."""
+    options = _options(arguments)
+    graph = RosGraph()
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            scene = Scene(graph, _rig(Path(folder) / "rig.yaml"))
+            scene.await_cameras(list(CAMERAS))
+            soak = _run(scene, options.minutes * 60, random.Random(options.seed), Soak(options.seed))
+    finally:
+        graph.close()
+    problems = soak.problems(min(300.0, options.minutes * 60 / 3))
+    result = asdict(soak) | {"problems": problems}
+    options.output.parent.mkdir(parents=True, exist_ok=True)
+    options.output.write_text(json.dumps(result, indent=1))
+    faults = sum(soak.faults.values())
+    print(f"{soak.seconds:.0f} s, {faults} faults, {soak.depth_images} depth images: {problems or 'fine'}")
+    return 1 if problems else 0
+
+
+def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--minutes", type=float, default=60.0)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--output", type=Path, default=Path("output/soak.json"))
+    return parser.parse_args(arguments)
+
+
+def _rig(path: Path) -> Path:
+    """Write the sample's rig without calibrations, which come from the topics and can therefore be spoiled."""
+    with open_recording(recordings.SAMPLE) as recording:
+        layout = discover_rig(recording)
+    found = {camera.name: camera for camera in layout.cameras}
+    cameras = tuple(found[name].model_copy(update={"calibration": None}) for name in CAMERAS)
+    save_rig_layout(path, layout.model_copy(update={"cameras": cameras, "anchor": CAMERAS[0]}))
+    return path
+
+
+def _run(scene: Scene, seconds: float, choose: random.Random, soak: Soak) -> Soak:
+    process = scene.graph._processes[0][0]
+    begin = time.monotonic()
+    change_at, due, next_sample = begin, begin, begin
+    seen: dict[str, list[int]] = {name: [] for name in CAMERAS}
+    while (now := time.monotonic()) - begin < seconds:
+        if process.poll() is not None:
+            soak.wrong_stamps.append(f"the node ended with {process.poll()}: {scene.graph.log()[-500:]}")
+            break
+        if now >= change_at:
+            change_at = now + _change(scene, choose, soak)
+        scene.cameras.cycle()
+        soak.sets_sent += 1
+        due = max(due + PERIOD, now)
+        scene.graph.spin(max(0.001, due - time.monotonic()))
+        _check_stamps(scene, seen, soak)
+        if now >= next_sample:
+            soak.samples.append((now - begin, *_of_process(process.pid)))
+            next_sample = now + 1.0
+    soak.seconds = time.monotonic() - begin
+    return soak
+
+
+def _change(scene: Scene, choose: random.Random, soak: Soak) -> float:
+    """Begin another fault of one or two cameras, or none, and say for how many seconds."""
+    scene.fail()
+    scene.cameras.infos = dict(scene.cameras.good_infos)
+    for camera in choose.sample(CAMERAS, choose.choice([0, 1, 1, 2])):
+        name = choose.choice(list(FAULTS))
+        soak.faults[name] += 1
+        if FAULTS[name].image is not None:
+            scene.cameras.faults[camera] = FAULTS[name].image
+        if FAULTS[name].info is not None:
+            bad = copy.deepcopy(scene.cameras.good_infos[camera])
+            FAULTS[name].info(bad)
+            scene.cameras.infos[camera] = bad
+    return choose.uniform(1.0, 6.0)
+
+
+def _check_stamps(scene: Scene, seen: dict[str, list[int]], soak: Soak) -> None:
+    """Trace every depth image to the one image of its camera with that stamp, and forget what is long past."""
+    for name, topic in DEPTH.items():
+        for message in scene.graph.received[topic]:
+            stamp = stamp_of(message)
+            soak.depth_images += 1
+            if stamp not in scene.cameras.sent[name] or stamp in seen[name]:
+                soak.wrong_stamps.append(
+                    f"depth of {name} at {stamp} ns: " + ("twice" if stamp in seen[name] else "never sent")
+                )
+            seen[name] = [*seen[name][-KEPT_STAMPS:], stamp]
+        scene.graph.received[topic].clear()
+        newest = sorted(scene.cameras.sent[name])[-KEPT_STAMPS:]
+        scene.cameras.sent[name] = (
+            set(newest) if len(scene.cameras.sent[name]) > 2 * KEPT_STAMPS else scene.cameras.sent[name]
+        )
+    for topic in set(scene.graph.received) - set(DEPTH.values()):
+        del scene.graph.received[topic][:-1]
+
+
+def _of_process(pid: int) -> tuple[float, int, int]:
+    """Return resident MiB, open files and threads."""
+    folder = Path(f"/proc/{pid}")
+    resident = int(folder.joinpath("statm").read_text().split()[1]) * 4096 / 2**20
+    return resident, len(list(folder.joinpath("fd").iterdir())), len(list(folder.joinpath("task").iterdir()))
+
+
+def _median(values: Sequence[float]) -> Any:
+    return sorted(values)[len(values) // 2]
+
+
+if __name__ == "__main__":
+    sys.exit(main())
