@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from cvcdepth_core.errors import CvcDepthError, NotPromotedError
-from cvcdepth_ros.commands import bench, check, evaluate, finetune, inspect, play, rig, run
+from cvcdepth_ros.commands import bench, check, evaluate, export, finetune, inspect, play, rig, run
 from cvcdepth_ros.version import package_version
 
 
@@ -37,6 +37,7 @@ COMMANDS: Mapping[str, Command] = {
     "finetune": finetune,
     "play": play,
     "bench": bench,
+    "export": export,
 }
 
 

@@ -2,6 +2,8 @@
 """The engines: equal to the network, independent of the batch, refused when they are not what they should be."""
 
 import copy
+import json
+from pathlib import Path
 from typing import get_args
 
 import numpy as np
@@ -9,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from cvcdepth_core.checkpoint import DepthModelSpec
+from cvcdepth_core.checkpoint import DepthModelSpec, save_checkpoint
 from cvcdepth_core.engines import BACKENDS, Precision, build_engine, is_installed, selection
 from cvcdepth_core.engines.chunks import ChunkedEngine
 from cvcdepth_core.engines.engine import DeviceMemoryError
@@ -19,7 +21,8 @@ from cvcdepth_core.engines.rewriting import RewrittenDepthNet
 from cvcdepth_core.engines.torch_engine import MixedPrecision, TorchEagerEngine, TorchEngine
 from cvcdepth_core.errors import ConfigError, EngineError
 from cvcdepth_core.estimator import DepthEstimator
-from cvcdepth_core.networks import ENCODERS, DepthNet
+from cvcdepth_core.networks import ENCODERS, DepthNet, disparity_to_depth
+from cvcdepth_ros.bag_replay import main
 from cvcdepth_ros.settings import ModelSettings
 
 HEIGHT, WIDTH = 64, 96
@@ -281,3 +284,34 @@ def test_tensorrt_wants_its_engine_built_first(tmp_path, monkeypatch: pytest.Mon
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     with pytest.raises(EngineError, match=r"no engine of this network .* cvcdepth export --tensorrt"):
         build_engine(lively_network("resnet18"), spec_of("resnet18"), "cuda", "tensorrt")
+
+
+@pytest.fixture
+def checkpoint(tmp_path: Path) -> Path:
+    path = tmp_path / "model.safetensors"
+    save_checkpoint(path, spec_of("resnet18"), lively_network("resnet18").state_dict())
+    return path
+
+
+@pytest.mark.skipif(not is_installed("onnxruntime"), reason="onnx or onnxruntime is not installed")
+def test_export_writes_a_checked_model_and_how_its_output_becomes_metres(checkpoint: Path, capsys):
+    assert main(["export", str(checkpoint), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["file"] == str(checkpoint.with_suffix(".onnx"))
+    assert result["relative_depth_error"] < 1e-4
+    assert checkpoint.with_suffix(".onnx").stat().st_size > 5e7
+    described = json.loads(checkpoint.with_suffix(".json").read_text())
+    assert (described["max_depth"], described["height"]) == (100.0, HEIGHT)
+    disparity = 0.25
+    fx = 200.0
+    depth = eval(described["depth"].partition("=")[2], {}, described | {"fx": fx, "disparity": disparity})
+    expected = disparity_to_depth(torch.full((1, 1, 1), disparity), torch.tensor(fx), 0.5, 100.0)
+    assert depth == pytest.approx(expected.item())
+    assert main(["export", str(checkpoint)]) == 1
+    assert "model.onnx: exists already; --force overwrites it" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a CUDA device is here")
+def test_a_tensorrt_engine_needs_a_gpu(checkpoint: Path, capsys):
+    assert main(["export", str(checkpoint), "--tensorrt"]) == 1
+    assert "device: 'cuda' is not available" in capsys.readouterr().err

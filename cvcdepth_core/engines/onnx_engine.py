@@ -63,7 +63,8 @@ class OnnxRuntimeEngine:
         options = {"device_id": device.index or 0} if device.type == "cuda" else {}
         self.device = device
         self.name = f"onnxruntime {onnxruntime.__version__} {device.type} float32"
-        self._session = _session(onnx_model(network, spec), [(provider, options)])
+        self.model = onnx_model(network, spec)
+        self._session = _session(self.model, [(provider, options)])
 
     def disparity(self, images: Tensor) -> Tensor:
         """See `DisparityEngine`."""
@@ -79,7 +80,6 @@ class TensorRtEngine:
         spec: DepthModelSpec,
         device: torch.device,
         precision: Precision,
-        cache: Path | None = None,
         build: bool = False,
     ) -> None:
         """EngineError when the engine was not built (`build` does it, which takes minutes)."""
@@ -87,7 +87,7 @@ class TensorRtEngine:
 
         self.device = device
         self.name = f"tensorrt of onnxruntime {onnxruntime.__version__} {precision}"
-        folder = engine_folder(network, spec, device, precision, cache)
+        folder = engine_folder(network, spec, device, precision)
         if not build and not any(folder.glob("*.engine")):
             raise EngineError(
                 f"{self.name}: no engine of this network for {torch.cuda.get_device_name(device)} in {folder}; "
@@ -102,13 +102,11 @@ class TensorRtEngine:
         return torch.cat([_run(self._session, chunk) for chunk in images.split(MOST_CAMERAS)])  # type: ignore[no-untyped-call]
 
 
-def engine_folder(
-    network: DepthNet, spec: DepthModelSpec, device: torch.device, precision: Precision, cache: Path | None = None
-) -> Path:
+def engine_folder(network: DepthNet, spec: DepthModelSpec, device: torch.device, precision: Precision) -> Path:
     """Name the folder of a built TensorRT engine, by GPU, versions, weights, size and precision."""
     import onnxruntime
 
-    root = cache or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "cvcdepth" / "tensorrt"
+    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "cvcdepth" / "tensorrt"
     gpu = torch.cuda.get_device_name(device).replace(" ", "-")
     capability = ".".join(map(str, torch.cuda.get_device_capability(device)))
     versions = f"onnxruntime-{onnxruntime.__version__}_cuda-{torch.version.cuda}"

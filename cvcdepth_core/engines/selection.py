@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Literal, get_args
 
 import torch
@@ -55,6 +56,32 @@ def build_engine(
         check_parity(engine, network, spec, precision)
     fallback = _on_cpu(network, spec) if cpu_without_memory and place.type == "cuda" else None
     return ChunkedEngine(engine, fallback)
+
+
+def export_onnx(network: DepthNet, spec: DepthModelSpec) -> tuple[bytes, float]:
+    """Return the network as an ONNX model and its relative depth error, as ONNX Runtime runs it on the CPU.
+
+    Raises EngineError when onnx or ONNX Runtime is not installed, or the depth is another one.
+    """
+    _refuse_missing("onnxruntime")
+    from cvcdepth_core.engines.onnx_engine import OnnxRuntimeEngine
+
+    engine = OnnxRuntimeEngine(network, spec, torch.device("cpu"))
+    return engine.model, check_parity(engine, network, spec, "float32")
+
+
+def build_tensorrt(network: DepthNet, spec: DepthModelSpec, device: str, precision: Precision) -> tuple[Path, float]:
+    """Build and keep the engine that the backend tensorrt uses; return its folder and its relative depth error.
+
+    Raises ConfigError when `device` is no GPU, EngineError without TensorRT or when the depth is another one.
+    """
+    place = resolve_device(device)
+    _refuse_impossible("tensorrt", place, precision)
+    _refuse_missing("tensorrt")
+    from cvcdepth_core.engines.onnx_engine import TensorRtEngine, engine_folder
+
+    engine = TensorRtEngine(network, spec, place, precision, build=True)
+    return engine_folder(network, spec, place, precision), check_parity(engine, network, spec, precision)
 
 
 def resolve_device(name: str) -> torch.device:

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`export`: the depth network for other programs, and for TensorRT."""
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from cvcdepth_core.errors import ConfigError
+from cvcdepth_ros.commands.arguments import add_json, print_result
+from cvcdepth_ros.version import package_version
+
+if TYPE_CHECKING:
+    from cvcdepth_core.checkpoint import Checkpoint
+
+SUMMARY = """Write the depth network as ONNX, or build its TensorRT engine.
+
+OUT.onnx takes `images` [B, 3, H, W], RGB in [0, 1], to `disparity` [B, 1, H, W]; OUT.json beside it says how disparity
+becomes metres, and for which size the network was trained. With --tensorrt the engine that `--backend tensorrt` uses is
+built for the GPU in this machine, which takes minutes, and is kept in ~/.cache/cvcdepth. Both are checked against the
+network in float64 before they are kept."""
+EXAMPLES: tuple[str, ...] = (
+    "export model.safetensors -o model.onnx",
+    "export model.safetensors --tensorrt --precision float16",
+)
+
+_DEPTH = "depth = fx / (focal_scale * (1 / max_depth + (1 / min_depth - 1 / max_depth) * disparity))"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("checkpoint", type=Path, metavar="CHECKPOINT", help="checkpoint file (safetensors)")
+    parser.add_argument("-o", "--output", type=Path, metavar="OUT", help="ONNX file to write [CHECKPOINT.onnx]")
+    parser.add_argument("--force", action="store_true", help="overwrite the file")
+    parser.add_argument("--tensorrt", action="store_true", help="build a TensorRT engine instead")
+    parser.add_argument(
+        "--precision", choices=("float32", "bfloat16", "float16"), default="float32", help="of TensorRT [float32]"
+    )
+    parser.add_argument("--device", default="cuda", metavar="TEXT", help="GPU to build for [cuda]")
+    add_json(parser)
+
+
+def execute(arguments: argparse.Namespace) -> None:
+    """Export, and tell what was written."""
+    from cvcdepth_core.checkpoint import load_checkpoint
+
+    checkpoint = load_checkpoint(arguments.checkpoint)
+    if arguments.tensorrt:
+        written, error = _build_tensorrt(checkpoint, arguments.precision, arguments.device)
+    else:
+        written, error = _write_onnx(checkpoint, arguments.output, arguments.force)
+    result = _description(checkpoint) | {"file": str(written), "relative_depth_error": error}
+    print_result(result, f"{written}: relative depth error {error:.1e} against float64", arguments.json)
+
+
+def _write_onnx(checkpoint: "Checkpoint", output: Path | None, force: bool) -> tuple[Path, float]:
+    from cvcdepth_core.atomic_file import write_atomically
+    from cvcdepth_core.engines import export_onnx
+
+    path = output or checkpoint.path.with_suffix(".onnx")
+    if path.exists() and not force:
+        raise ConfigError(f"{path}: exists already; --force overwrites it")
+    model, error = export_onnx(checkpoint.build_depth_net(), checkpoint.spec)
+    write_atomically(path, model)
+    description = json.dumps(_description(checkpoint), indent=2) + "\n"
+    write_atomically(path.with_suffix(".json"), description.encode())
+    return path, error
+
+
+def _build_tensorrt(
+    checkpoint: "Checkpoint", precision: Literal["float32", "bfloat16", "float16"], device: str
+) -> tuple[Path, float]:
+    from cvcdepth_core.engines import build_tensorrt
+
+    return build_tensorrt(checkpoint.build_depth_net(), checkpoint.spec, device, precision)
+
+
+def _description(checkpoint: "Checkpoint") -> dict[str, Any]:
+    """Say what a program needs to use the model."""
+    return {
+        "version": package_version(),
+        "checkpoint": checkpoint.path.name,
+        "sha256": checkpoint.sha256,
+        **checkpoint.spec.model_dump(),
+        "input": "images [B, 3, H, W], float32 RGB in [0, 1], rectified; H and W multiples of 32",
+        "output": "disparity [B, 1, H, W], float32 in (0, 1)",
+        "depth": _DEPTH,
+        "fx": "each camera's focal length in pixels of H x W; depth is metres along the optical axis",
+    }
