@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from cvcdepth_core.checkpoint import DepthModelSpec, load_checkpoint
-from cvcdepth_core.engines import Precision, build_engine, resolve_device  # noqa: F401 - used from here elsewhere
+from cvcdepth_core.engines import Precision, build_engine
 from cvcdepth_core.images import Picture
 from cvcdepth_core.networks import DepthNet, disparity_to_depth
 from cvcdepth_core.preprocess import SurroundPreprocessor, to_tensor
