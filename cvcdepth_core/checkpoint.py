@@ -237,6 +237,13 @@ def _parse_spec(path: Path, text: str | None) -> DepthModelSpec:
         raise CheckpointError(f"{path}: {wrong}") from error
 
 
+def check_sha256(path: Path, want: str) -> None:
+    """Raise CheckpointError, naming both hashes, unless the file's SHA-256 is `want`, or `want` is empty."""
+    found = _sha256([path]) if want else ""
+    if found != want:
+        raise CheckpointError(f"{path}: has SHA-256 {found}, but {want} is required")
+
+
 def _sha256(files: Iterable[Path]) -> str:
     digest = hashlib.sha256()
     for path in files:

@@ -32,6 +32,8 @@ class ModelSettings(Settings):
 
     checkpoint: str = ""
     """Checkpoint file (safetensors) of the depth network; without one, or 'default', the package's own small model."""
+    checkpoint_sha256: str = Field("", pattern="^([0-9a-f]{64})?$")
+    """SHA-256 that the checkpoint file must have, 64 hexadecimal digits; empty takes any."""
     untrained: bool = False
     """Run a network with random weights instead of a checkpoint. Its depth has the right form and no meaning."""
     encoder: str = "resnet18"
@@ -63,12 +65,13 @@ class ModelSettings(Settings):
 
     def build_estimator(self) -> "DepthEstimator":
         """Load the checkpoint, or make the untrained network; CheckpointError or ConfigError says what is wrong."""
-        from cvcdepth_core.checkpoint import DepthModelSpec
+        from cvcdepth_core.checkpoint import DepthModelSpec, check_sha256
         from cvcdepth_core.estimator import DepthEstimator
 
         engine = self.model_dump(include={"backend", "precision", "cpu_without_memory"})
         path = self.checkpoint_path
         if path is not None:
+            check_sha256(path, self.checkpoint_sha256)
             return DepthEstimator.from_checkpoint(path, self.device, **engine)
         try:
             spec = DepthModelSpec(

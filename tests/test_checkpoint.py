@@ -11,6 +11,7 @@ from safetensors.torch import save_file
 
 from cvcdepth_core.checkpoint import (
     DepthModelSpec,
+    check_sha256,
     import_released,
     load_checkpoint,
     load_imagenet_encoder,
@@ -232,3 +233,15 @@ def test_imagenet_weights_of_another_architecture_are_refused(imagenet_file):
 def test_an_impossible_spec_is_refused(wrong):
     with pytest.raises(ValueError, match="validation error"):
         DepthModelSpec(**{**SPEC.model_dump(), **wrong})
+
+
+def test_a_checkpoint_is_pinned_by_its_hash(tmp_path: Path):
+    path = tmp_path / "model.safetensors"
+    path.write_bytes(b"weights")
+    digest = "9a129472e16bcc1aef2a6e27d8b0ff3a2ecf3e7b7a0b4a7b8f3e2b1f6c7f9a00"
+    with pytest.raises(
+        CheckpointError, match=rf"model.safetensors: has SHA-256 [0-9a-f]{{64}}, but {digest} is required"
+    ):
+        check_sha256(path, digest)
+    check_sha256(path, hashlib.sha256(b"weights").hexdigest())
+    check_sha256(path, "")
