@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time and memory of one full training step: networks, every term, backward, optimiser. Prints one JSON line.
+"""Time and memory of one full training step: networks, every term, backward, optimiser. Prints JSON lines.
+
+The baseline is the whole step; the other lines are its parts. Where others use the machine, read the CPU times.
 
 python benchmarks/training_step.py --samples 1
 python benchmarks/training_step.py --device cuda --bf16 --samples 4
@@ -8,18 +10,15 @@ python benchmarks/training_step.py --device cuda --bf16 --samples 4
 from __future__ import annotations
 
 import argparse
-import json
 import math
-import os
-import platform
-import resource
-import statistics
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import TypeVar
 
+import numpy as np
 import torch
+from measuring import Timings, json_lines, peak_memory_mb, print_line
+from numpy.typing import NDArray
 from torch import Tensor
 
 from cvcdepth_core.networks import DepthNet, PoseNet
@@ -28,8 +27,11 @@ from cvcdepth_core.rig_batch import RigBatch
 from cvcdepth_core.surround_model import SurroundModel
 
 Result = TypeVar("Result")
+Seconds = NDArray[np.float64]
+"""[wall, CPU]."""
 
 CAMERAS = 6
+PARTS = ("step", "networks", "objective")
 RING_ORDER = (0, 2, 4, 5, 3, 1)  # front, front-right, back-right, back, back-left, front-left
 
 
@@ -39,7 +41,10 @@ def main() -> None:
     if options.threads:
         torch.set_num_threads(options.threads)
     batch = ring_of_cameras(options.samples, options.height, options.width).to(options.device)
-    print(json.dumps(measure(options, batch)))
+    timings = measure(options, batch)
+    sizes = {name: value for name, value in vars(options).items() if name not in ("steps", "threads")}
+    for line in json_lines("training_step", timings, "step", sizes, options.device):
+        print_line(line | {"peak_memory_mb": round(peak_memory_mb(options.device)), "threads": torch.get_num_threads()})
 
 
 def parse_options() -> argparse.Namespace:
@@ -52,14 +57,11 @@ def parse_options() -> argparse.Namespace:
     parser.add_argument("--pose-method", default="front", help="front, joint_front, joint or per_camera")
     parser.add_argument("--bf16", action="store_true", help="run the networks under bfloat16 autocast")
     parser.add_argument("--steps", type=int, default=5, help="measured steps, after one to warm up")
-    parser.add_argument(
-        "--clock", choices=["wall", "cpu"], default="wall", help="cpu: seconds of this process, for a shared machine"
-    )
     parser.add_argument("--threads", type=int, default=0, help="CPU threads, 0 for torch's choice")
     return parser.parse_args()
 
 
-def measure(options: argparse.Namespace, batch: RigBatch) -> dict[str, object]:
+def measure(options: argparse.Namespace, batch: RigBatch) -> dict[str, Timings]:
     model = SurroundModel(
         DepthNet(options.encoder),
         PoseNet(options.encoder),
@@ -69,22 +71,9 @@ def measure(options: argparse.Namespace, batch: RigBatch) -> dict[str, object]:
     ).to(options.device)
     config = ObjectiveConfig(pose_consistency=0.1 if options.pose_method == "per_camera" else 0.0)
     optimizer = torch.optim.Adam(model.parameters(), lr=1e-4)
-    timings = [timed_step(options, model, batch, config, optimizer) for _ in range(options.steps + 1)][1:]
-    step, networks, objective = (1000 * statistics.median(column) for column in zip(*timings, strict=True))
-    return {
-        "benchmark": "training_step",
-        **{key.replace("-", "_"): value for key, value in vars(options).items()},
-        "machine": machine(options.device),
-        "torch": torch.__version__,
-        "python": platform.python_version(),
-        "cpu_threads": torch.get_num_threads(),
-        "load_average": round(os.getloadavg()[0], 1),
-        "step_ms": round(step, 1),
-        "networks_ms": round(networks, 1),
-        "objective_ms": round(objective, 1),
-        "share_outside_networks": round(1 - networks / step, 3),
-        "peak_memory_gb": round(peak_memory(options.device), 2),
-    }
+    steps = [timed_step(options, model, batch, config, optimizer) for _ in range(options.steps + 1)][1:]
+    columns = {name: np.stack(column).T.tolist() for name, column in zip(PARTS, zip(*steps, strict=True), strict=True)}
+    return {name: Timings(wall, cpu) for name, (wall, cpu) in columns.items()}
 
 
 def timed_step(
@@ -93,7 +82,7 @@ def timed_step(
     batch: RigBatch,
     config: ObjectiveConfig,
     optimizer: torch.optim.Optimizer,
-) -> tuple[float, float, float]:
+) -> tuple[Seconds, Seconds, Seconds]:
     """Return seconds for the whole step, for both networks and for the objective, forward and backward each.
 
     The graph is cut between networks and objective, so that the two halves of the backward pass can be told apart; the
@@ -105,7 +94,7 @@ def timed_step(
         with torch.autocast(batch.frames.device.type, torch.bfloat16, enabled=options.bf16):
             return model(batch, batch.frames, no_flip, no_flip)  # type: ignore[no-any-return]
 
-    began = now(options)
+    began = now()
     optimizer.zero_grad(set_to_none=True)
     prediction, forward = timed(options, predict)
     leaves = [
@@ -116,23 +105,23 @@ def timed_step(
     gradients = [leaf.grad for leaf in leaves]
     _, backward = timed(options, lambda: torch.autograd.backward(outputs, gradients))
     timed(options, optimizer.step)
-    return now(options) - began, forward + backward, objective
+    return now() - began, forward + backward, objective
 
 
 def backpropagate_objective(batch: RigBatch, prediction: Prediction, config: ObjectiveConfig) -> None:
     evaluate_objective(batch, prediction, config).loss.backward()  # type: ignore[no-untyped-call]
 
 
-def timed(options: argparse.Namespace, work: Callable[[], Result]) -> tuple[Result, float]:
-    began = now(options)
+def timed(options: argparse.Namespace, work: Callable[[], Result]) -> tuple[Result, Seconds]:
+    began = now()
     result = work()
     if options.device.startswith("cuda"):
         torch.cuda.synchronize()
-    return result, now(options) - began
+    return result, now() - began
 
 
-def now(options: argparse.Namespace) -> float:
-    return time.process_time() if options.clock == "cpu" else time.perf_counter()
+def now() -> Seconds:
+    return np.array([time.perf_counter(), time.process_time()])
 
 
 def ring_of_cameras(samples: int, height: int, width: int) -> RigBatch:
@@ -163,21 +152,6 @@ def camera_pose(yaw_right: float) -> Tensor:
     pose = torch.eye(4)
     pose[:3] = torch.stack([right, down, forward, forward], dim=1)
     return pose
-
-
-def machine(device: str) -> str:
-    if device.startswith("cuda"):
-        return torch.cuda.get_device_name()
-    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
-    models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return f"{models[0] if models else platform.processor()}, {len(models) or '?'} CPUs"
-
-
-def peak_memory(device: str) -> float:
-    """Return GiB: what torch allocated on the GPU, or the process's greatest resident size on the CPU."""
-    if device.startswith("cuda"):
-        return torch.cuda.max_memory_allocated() / 2**30
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
 
 
 if __name__ == "__main__":
