@@ -37,7 +37,7 @@ def camera_status(
     silence = watch.seconds_since_image
     values = {
         "state": condition.state.value,
-        "received": statistics.received,
+        "received": statistics.received + watch.repeated,
         "matched": statistics.matched,
         "queued": statistics.queued,
         "sets without it": statistics.missed,

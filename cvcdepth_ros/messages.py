@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvcdepth_core.calibration import Calibration, calibration_from_fields
-from cvcdepth_core.errors import ConfigError, RigError
+from cvcdepth_core.errors import ConfigError, ImageError, RigError
 from cvcdepth_core.images import Picture, Reduction, decode_compressed, decode_raw, reduce_picture
 from cvcdepth_core.poses import Pose, quaternion_from_rotation
 from cvcdepth_ros.synchronizer import NANOSECONDS
@@ -32,13 +32,19 @@ def stamp_ns(message: Any) -> int:
     return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
 
 
-def picture_from_message(message: Any, camera: str, reduce: Reduction = 1) -> Picture:
+def picture_from_message(
+    message: Any, camera: str, reduce: Reduction = 1, size: tuple[int, int] | None = None
+) -> Picture:
     """Decode a `sensor_msgs/Image` or `CompressedImage` to RGB, each `reduce` x `reduce` pixels to one.
 
-    ImageError names the camera and what is wrong.
+    ImageError names the camera and what is wrong, also when the image's width and height are not `size`.
     """
     if hasattr(message, "format"):
-        return decode_compressed(message.format, message.data, camera, reduce=reduce)
+        return decode_compressed(message.format, message.data, camera, reduce=reduce, size=size)
+    if size is not None and (message.width, message.height) != size:
+        raise ImageError(
+            f"camera {camera}: image of {message.width}x{message.height}, but its camera_info says {size[0]}x{size[1]}"
+        )
     picture = decode_raw(
         message.width, message.height, message.encoding, message.step, bool(message.is_bigendian), message.data, camera
     )

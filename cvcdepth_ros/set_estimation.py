@@ -48,7 +48,7 @@ def picture_or_error(message: Any, camera: str, rectifier: Rectifier, latencies:
     """
     try:
         with latencies.measure("decode"):
-            picture = picture_from_message(message, camera, rectifier.reduction)
+            picture = picture_from_message(message, camera, rectifier.reduction, rectifier.image_size)
         with latencies.measure("preprocess"):
             return rectifier(picture, camera, rectifier.reduction)
     except ImageError as error:

@@ -256,3 +256,14 @@ def test_closing_says_whether_the_last_set_is_done_with(start, estimator, images
     assert not running.pipeline.close()
     slowed.gate.set()
     running.wait(running.pipeline.close)
+
+
+def test_an_image_of_another_size_than_its_calibrations_is_told_in_full_size(start, estimator, layout, images):
+    running = start(estimator)
+    left = next(camera for camera in layout.cameras if camera.name == "left")
+    large = left.model_copy(update={"calibration": left.calibration.model_copy(update={"width": 3840, "height": 2160})})
+    cameras = tuple(large if camera is left else camera for camera in layout.cameras)
+    running.pipeline.set_rig(layout.model_copy(update={"cameras": cameras}).complete())
+    running.feed(images[:12])
+    running.wait(lambda: running.pipeline.counters["refused"])
+    assert running.pipeline.problem == "camera left: image of 960x540, but its camera_info says 3840x2160"

@@ -467,7 +467,7 @@ def test_full_size_raw_images_at_ten_hertz_are_not_lost(graph, messages, rig_con
         )
     # Best effort, or a publisher that keeps fewer images, loses nothing on a quiet machine either; a test must not
     # depend on what else runs.
-    graph.start_node(rig=write_rig(tmp_path, rig_content), reliable=True, **SMALL)
+    graph.start_node(rig=write_rig(tmp_path, rig_content), reliable=True, frozen_after=0.0, **SMALL)
     graph.subscribe(Image, "/surround_depth/front/depth/image_rect")
     graph.await_subscribers([f"/camera/{name}/image_raw" for name in CAMERAS])
     start = time.monotonic()
