@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The SROS 2 policy grants the running node what it has, and nothing else."""
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="these tests need a ROS environment")
+
+from recordings import CAMERAS, SAMPLE
+from ros_graph import RosGraph
+from test_camera_failures import Scene
+
+from cvcdepth_core.rig import save_rig_layout
+from cvcdepth_ros.bags import open_recording
+from cvcdepth_ros.recorded_rig import discover_rig
+
+POLICY = Path(__file__).parents[2] / "security" / "policies" / "surround_depth.policy.xml"
+ONLY_SOMETIMES = {"/clock", "/tf_static"}
+
+
+@pytest.fixture(scope="module")
+def graph(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RosGraph]:
+    rig = tmp_path_factory.mktemp("rig") / "rig.yaml"
+    with open_recording(SAMPLE) as recording:
+        save_rig_layout(rig, discover_rig(recording))
+    graph = RosGraph()
+    try:
+        Scene(graph, rig).await_cameras(list(CAMERAS))
+        yield graph
+    finally:
+        graph.close()
+
+
+def granted(kind: str, how: str, item: str) -> set[str]:
+    profile = ElementTree.parse(POLICY).getroot().find("./enclaves/enclave/profiles/profile")
+    assert profile is not None
+    assert (profile.get("ns"), profile.get("node")) == ("/", "surround_depth")
+    return {
+        str(entry.text) for block in profile.findall(kind) if block.get(how) == "ALLOW" for entry in block.findall(item)
+    }
+
+
+def test_the_policy_allows_exactly_what_the_node_has(graph):
+    subscribed = {name for name, _ in graph.node.get_subscriber_names_and_types_by_node("surround_depth", "/")}
+    published = {name for name, _ in graph.node.get_publisher_names_and_types_by_node("surround_depth", "/")}
+    served = {name for name, _ in graph.node.get_service_names_and_types_by_node("surround_depth", "/")}
+    assert granted("topics", "subscribe", "topic") - ONLY_SOMETIMES == subscribed - ONLY_SOMETIMES
+    assert granted("topics", "publish", "topic") == published
+    assert granted("services", "reply", "service") == served
+    assert not graph.node.get_client_names_and_types_by_node("surround_depth", "/")
