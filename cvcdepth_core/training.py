@@ -32,7 +32,7 @@ from cvcdepth_core.atomic_file import write_atomically
 from cvcdepth_core.augmentation import draw_flips, jitter_colors
 from cvcdepth_core.checkpoint import Checkpoint, load_network_state, save_checkpoint
 from cvcdepth_core.distributed import ALONE, Processes, share_batch_statistics
-from cvcdepth_core.errors import CheckpointError, ConfigError, TrainingError
+from cvcdepth_core.errors import CheckpointError, ConfigError, OutputError, TrainingError
 from cvcdepth_core.networks import DepthNet, PoseNet
 from cvcdepth_core.objective import ObjectiveValue, Prediction, evaluate_objective
 from cvcdepth_core.rig_batch import RigBatch
@@ -273,6 +273,8 @@ class Trainer:
                 self._average.load_state_dict(state["average"])
         if self._processes.is_first:
             self._drop_log_of_lost_steps()
+            for unfinished in self._run.glob(".*.tmp"):
+                unfinished.unlink()  # of a process that was killed while it wrote
 
     def _drop_log_of_lost_steps(self) -> None:
         """Drop what a killed run had logged after its last checkpoint: it will be made again."""
@@ -440,9 +442,14 @@ class Trainer:
         return json.dumps({**place, "validation": dict(outcome.scores), "stop": outcome.stop}).encode()
 
     def _log(self, entry: Mapping[str, Any]) -> None:
-        if self._processes.is_first:
-            with (self._run / LOG_FILE).open("a", encoding="utf-8") as file:
+        if not self._processes.is_first:
+            return
+        path = self._run / LOG_FILE
+        try:
+            with path.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(entry) + "\n")
+        except OSError as error:
+            raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
 def _prepared(model: SurroundModel, device: torch.device, processes: Processes) -> SurroundModel:

@@ -2,9 +2,13 @@
 """The training loop: what a run folder holds, what resuming computes, what a bad loss does."""
 
 import json
+import random
+import resource
 import signal
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +17,7 @@ import torch
 from scenes import random_batch
 
 from cvcdepth_core.checkpoint import DepthModelSpec, load_checkpoint, save_checkpoint
-from cvcdepth_core.errors import CheckpointError, TrainingError
+from cvcdepth_core.errors import CheckpointError, ConfigError, OutputError, TrainingError
 from cvcdepth_core.networks import DepthNet
 from cvcdepth_core.training import Trainer, ValidationOutcome, build_surround_model
 from cvcdepth_core.training_config import OptimizerConfig, PoseConfig, TrainingConfig
@@ -80,7 +84,7 @@ def test_a_run_leaves_a_checkpoint_a_log_and_its_configuration(uninterrupted):
     assert "learning_rate: 0.0001" in (uninterrupted / "config.yaml").read_text()
 
 
-@pytest.mark.parametrize("kill_at", [1, 6])
+@pytest.mark.parametrize("kill_at", [1, 5])
 def test_a_run_killed_at_any_moment_resumes_to_the_weights_of_an_uninterrupted_one(uninterrupted, tmp_path, kill_at):
     script = (
         "import sys, torch; from pathlib import Path; torch.set_num_threads(1); import test_training as t\n"
@@ -93,13 +97,16 @@ def test_a_run_killed_at_any_moment_resumes_to_the_weights_of_an_uninterrupted_o
     process = subprocess.Popen(
         [sys.executable, "-c", script, tmp_path], stdout=subprocess.PIPE, text=True, env={"PYTHONPATH": folders}
     )
+    (tmp_path / f".state.pt.{process.pid}.tmp").write_bytes(b"of a process that was killed while it wrote")
     assert process.stdout is not None
     while int(process.stdout.readline()) < kill_at:
         pass
+    time.sleep(random.uniform(0, 0.5))  # into a step, into writing, into the epoch's end
     process.send_signal(signal.SIGKILL)
     process.wait()
     resumed = trainer(tmp_path, checkpoint_every=1)
-    assert kill_at <= resumed.progress.step < 8
+    assert not list(tmp_path.glob(".*.tmp"))
+    assert kill_at <= resumed.progress.step <= 8
     resumed.train(quiet=True)
     expected, found = (load_checkpoint(run / "last.safetensors") for run in (uninterrupted, tmp_path))
     assert found.metadata == expected.metadata
@@ -219,6 +226,77 @@ def test_the_log_of_a_killed_run_goes_on_without_what_was_lost(tmp_path):
     ]
 
 
+class Trouble(Watcher):
+    """Makes some after the log of a step."""
+
+    def __init__(self, step: int, make: Callable[[], None]) -> None:
+        super().__init__()
+        self._step, self._make = step, make
+
+    def on_step(self, trainer, entry):
+        if entry["step"] == self._step:
+            self._make()
+
+
+def interrupt():
+    raise KeyboardInterrupt
+
+
+def forbid_large_files():
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # a write then fails with an error, as on a full disk
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
+
+
+def allow_large_files():
+    hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
+    resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
+
+
+def test_a_full_disk_leaves_the_last_good_checkpoint_and_is_named(tmp_path):
+    run = watched(tmp_path, [ValidationOutcome({})] * 9, Trouble(6, forbid_large_files))
+    try:
+        with pytest.raises(OutputError, match=r"state.pt: cannot be written: File too large"):
+            run.train(quiet=True)
+    finally:
+        allow_large_files()
+    assert load_checkpoint(tmp_path / "last.safetensors").metadata["step"] == "4"
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "config.yaml",
+        "last.safetensors",
+        "log.jsonl",
+        "state.pt",
+    ]
+    resumed = watched(tmp_path, [ValidationOutcome({})] * 9, None)
+    assert resumed.progress.step == 4
+
+
+def test_an_interrupted_run_leaves_the_last_good_checkpoint(tmp_path):
+    run = watched(tmp_path, [ValidationOutcome({})] * 9, Trouble(6, interrupt))
+    with pytest.raises(KeyboardInterrupt):
+        run.train(quiet=True)
+    assert load_checkpoint(tmp_path / "last.safetensors").metadata["step"] == "4"
+    assert watched(tmp_path, [], None).progress.step == 4
+
+
+def test_networks_run_in_half_precision_while_the_weights_stay_whole(tmp_path):
+    batches = RandomBatches()
+    batches.samples = 1
+    run = trainer(tmp_path, batches, epochs=1, autocast="bfloat16", average_decay=None)
+    seen = []
+    head = run.model.depth_net.depth_decoder.decoder[-1].conv
+    head.register_forward_hook(lambda module, inputs, output: seen.append((module.weight.dtype, output.dtype)))
+    run.train(quiet=True)
+    assert seen == [(torch.float32, torch.bfloat16)]
+    assert run.progress.skipped == 0
+    assert log_of(tmp_path)[0]["loss"] > 0
+
+
+def test_compiling_without_a_compiler_is_refused_by_what_is_missing(tmp_path, monkeypatch):
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    with pytest.raises(ConfigError, match=r"optimizer.compile is true.*'no-such-compiler' is not there"):
+        trainer(tmp_path, compile=True)
+
+
 def test_unreadable_batches_are_passed_over_and_counted(tmp_path):
     run = trainer(tmp_path, RandomBatches(missing=(1, 2)), samples_per_step=2, epochs=1)
     run.train(quiet=True)
@@ -246,6 +324,14 @@ def test_the_gradient_of_a_step_is_the_mean_over_its_samples_however_they_are_ba
         weight.grad = torch.full_like(weight, 6.0)
         run._mean_gradient_norm(samples)
         assert float(weight.grad.mean()) == pytest.approx(6 / samples)
+
+
+def test_a_long_gradient_is_shortened_and_its_length_is_told(tmp_path):
+    run = trainer(tmp_path, max_gradient_norm=0.5)
+    weight = run.model.pose_net.pose_decoder.net[0].weight
+    weight.grad = torch.ones_like(weight)
+    assert run._mean_gradient_norm(1) == pytest.approx(weight.numel() ** 0.5)
+    assert float(weight.grad.norm()) == pytest.approx(0.5, rel=1e-4)
 
 
 def test_training_starts_from_a_checkpoint_of_the_same_meaning_only(tmp_path):
