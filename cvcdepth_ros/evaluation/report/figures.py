@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from cvcdepth_core.scores import ALL, OVERLAP, Score
 from cvcdepth_ros.evaluation.frames import SetScore
@@ -46,6 +47,7 @@ def time_series(sets: Sequence[SetScore]) -> bytes:
     for axes, title in ((errors, "Abs Rel"), (disagreement, "median relative disagreement, label-free")):
         axes.set_title(title, loc="left", color=TEXT, fontsize=11)
         axes.set_xlim(-0.5, max(len(sets) - 0.5, 0.5))
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.set_ylim(0, 1.2 * axes.dataLim.ymax if axes.has_data() else 1)
         for start in starts[1:]:
             axes.axvline(start - 0.5, color=LINES)
