@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
@@ -29,23 +30,55 @@ class TorchEagerEngine:
 
 
 class TorchEngine:
-    """The rewritten network with channels last; compiled, its kernels are fused and replayed as one CUDA graph."""
+    """The rewritten network with channels last; compiled, its kernels are fused and replayed as a CUDA graph."""
 
     def __init__(
         self, network: DepthNet, device: torch.device, precision: Precision = "float32", compiled: bool = False
     ) -> None:
         self.name = f"{'torch_compiled' if compiled else 'torch'} {torch.__version__} {precision}"
         self.device = device
-        rewritten = MixedPrecision(RewrittenDepthNet(network), getattr(torch, precision))
-        self._network: nn.Module = rewritten.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        if compiled:
-            self._network = torch.compile(self._network, mode="reduce-overhead", dynamic=False)  # type: ignore[assignment]
+        mixed = MixedPrecision(RewrittenDepthNet(network), getattr(torch, precision))
+        mixed = mixed.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self._run: Callable[[Tensor], Tensor] = CudaGraphs(torch.compile(mixed, dynamic=False)) if compiled else mixed
 
     @torch.inference_mode()
     def disparity(self, images: Tensor) -> Tensor:
         """See `DisparityEngine`."""
-        disparity: Tensor = self._network(images.contiguous(memory_format=torch.channels_last))
-        return disparity.clone()  # a CUDA graph writes its next result where it wrote this one
+        return self._run(images.contiguous(memory_format=torch.channels_last))
+
+
+class CudaGraphs:
+    """A network whose kernels are recorded once per shape of its input, and then started all at once.
+
+    torch's own `reduce-overhead` does this too, but only in the thread that compiled; the node infers in another.
+    """
+
+    def __init__(self, network: Callable[[Tensor], Tensor]) -> None:
+        self._network = network
+        self._recorded: dict[torch.Size, tuple[torch.cuda.CUDAGraph, Tensor, Tensor]] = {}
+
+    def __call__(self, images: Tensor) -> Tensor:
+        """Return what the network gives, in memory of its own."""
+        with torch.cuda.device(images.device):
+            if images.shape not in self._recorded:
+                self._recorded[images.shape] = self._record(images.clone())
+            graph, taken, given = self._recorded[images.shape]
+            taken.copy_(images)
+            graph.replay()
+            return given.clone()
+
+    def _record(self, images: Tensor) -> tuple[torch.cuda.CUDAGraph, Tensor, Tensor]:
+        """Run it aside until all is compiled and chosen, then record, as torch's documentation of CUDA graphs says."""
+        aside = torch.cuda.Stream()  # type: ignore[no-untyped-call]
+        aside.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(aside):
+            for _ in range(3):
+                self._network(images)
+        torch.cuda.current_stream().wait_stream(aside)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            given = self._network(images)
+        return graph, images, given
 
 
 class MixedPrecision(nn.Module):
