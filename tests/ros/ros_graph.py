@@ -7,6 +7,7 @@ Importing torch takes more processor time than most tests of the node, so their 
 imported the node and done nothing else. test_demo.py and others start it as users do.
 """
 
+import gc
 import importlib
 import itertools
 import multiprocessing
@@ -86,7 +87,10 @@ def _run_node(arguments: Sequence[str], environment: dict[str, str], log: Path) 
         for stream in (sys.stdout, sys.stderr):
             stream.flush()
             os.dup2(output.fileno(), stream.fileno())
-    importlib.import_module(NODE_MODULE).main([NODE_MODULE, *arguments])
+    try:
+        importlib.import_module(NODE_MODULE).main([NODE_MODULE, *arguments])
+    finally:
+        gc.collect()  # A forked process ends without it, and DDS would leave its shared memory behind.
 
 
 class RosGraph:
@@ -176,6 +180,7 @@ class RosGraph:
         self._executor.shutdown()
         self.node.destroy_node()
         rclpy.shutdown(context=self._context)
+        gc.collect()  # It is the end of the context that frees DDS's shared memory.
         self._resources.close()
 
     def _on_diagnostics(self, message: Any) -> None:
