@@ -2,6 +2,7 @@
 """Faults injected over DDS into one running node: what is said, what is published meanwhile, and that it recovers."""
 
 import copy
+import itertools
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -37,8 +38,11 @@ class Fault:
 
 
 def _content(make: Callable[[bytes], bytes]) -> Callable[[Any], Any]:
+    """Replace the content; what always is the same would make the camera frozen."""
+    count = itertools.count()
+
     def change(image: Any) -> Any:
-        image.data = make(bytes(image.data))
+        image.data = make(bytes(image.data)) + next(count).to_bytes(2, "little")
         return image
 
     return change
@@ -123,7 +127,7 @@ FAULTS = {
     "stamps everything zero": Fault("frozen", _zero_stamp),
     "stamps an hour ahead": Fault("unmatched", _stamp(3600)),
     "stamps an hour back": Fault("unmatched", _stamp(-900)),
-    "sends no bytes": Fault("begins with nothing", _content(lambda jpeg: b"")),
+    "sends two bytes": Fault("neither JPEG nor PNG", _content(lambda jpeg: b"")),
     "sends HTML": Fault("neither JPEG nor PNG", _content(lambda jpeg: b"<html><script>alert(1)</script></html>")),
     "sends WebP": Fault("neither JPEG nor PNG", _content(lambda jpeg: b"RIFF\x10\0\0\0WEBPVP8 ")),
     "sends JPEG cut in the middle": Fault("it was cut", _content(lambda jpeg: jpeg[: len(jpeg) // 2])),
