@@ -95,7 +95,8 @@ class TensorRtEngine:
             )
         folder.mkdir(parents=True, exist_ok=True)
         options = _tensorrt_options(spec, device, precision, folder)
-        self._session = _session(onnx_model(network, spec), [("TensorrtExecutionProvider", options)])
+        cuda = ("CUDAExecutionProvider", {"device_id": device.index or 0})  # for what TensorRT does not know
+        self._session = _session(onnx_model(network, spec), [("TensorrtExecutionProvider", options), cuda])
 
     def disparity(self, images: Tensor) -> Tensor:
         """See `DisparityEngine`."""
