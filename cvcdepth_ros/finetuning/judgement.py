@@ -20,10 +20,11 @@ Basis = Literal["LiDAR", "label-free"]
 
 LABEL_FREE_SCORE = "photometric"
 """Mean of the two photometric errors of an image, to its neighbours and to the picture before. Unlike disagreement it
-cannot be made good by depth that is consistent and wrong: it has to explain the pictures."""
+cannot be made good by depth that is consistent and wrong: it has to explain the pictures. Depth by which nothing of an
+image is seen elsewhere does not explain it: that counts as the greatest error, 1."""
 
 LIDAR_SCORE = "abs_rel"
-_LOST_AT_MOST = 0.1  # of the images: depth that sees nothing of the others is no progress
+_UNEXPLAINED = 1.0
 _SHOWN_METRICS = ("abs_rel", "rmse", "delta_1")
 
 
@@ -82,7 +83,7 @@ def score_of(result: EvaluationResult) -> float:
     """Return the number that validations are ranked by, lower is better; NaN where nothing could be measured."""
     if result.truth_points:
         return result.summary().mean[ALL].metrics[LIDAR_SCORE]
-    return mean([value for image in result.images if not math.isnan(value := photometric(image))])
+    return mean([photometric(image) for image in result.images])
 
 
 def numbers_of(result: EvaluationResult) -> dict[str, float]:
@@ -105,9 +106,9 @@ def camera_numbers(result: EvaluationResult) -> dict[str, dict[str, float | None
 
 
 def photometric(image: ImageScore) -> float:
-    """Return the image's label-free score; NaN where its picture cannot be compared with another."""
+    """Return the image's label-free score."""
     errors = (image.label_free.spatial_photometric, image.label_free.temporal_photometric)
-    return mean([error for error in errors if not math.isnan(error)])
+    return mean([error for error in errors if not math.isnan(error)] or [_UNEXPLAINED])
 
 
 def known(numbers: Mapping[str, float]) -> dict[str, float | None]:
@@ -118,22 +119,13 @@ def known(numbers: Mapping[str, float]) -> dict[str, float | None]:
 def _camera_numbers(result: EvaluationResult, camera: str, metrics: Mapping[str, float]) -> dict[str, float]:
     images = [image for image in result.images if image.camera == camera]
     shown = {name: metrics[name] for name in _SHOWN_METRICS}
-    label_free = mean([value for image in images if not math.isnan(value := photometric(image))])
+    label_free = mean([photometric(image) for image in images])
     return {**shown, "scale": _median([image.scale for image in images]), LABEL_FREE_SCORE: label_free}
 
 
 def _compare_label_free(before: EvaluationResult, after: EvaluationResult) -> Comparison:
-    """Compare over the images that have a score in both; raises ConfigError when too many have lost theirs."""
     cameras = before.scores.cameras
-    first, second = (_label_free_values(result, cameras) for result in (before, after))
-    scored, lost = 0, 0
-    for key in first.keys() & second.keys():
-        unknown = np.isnan(second[key])
-        scored, lost = scored + int((~np.isnan(first[key])).sum()), lost + int((unknown & ~np.isnan(first[key])).sum())
-        first[key] = np.where(unknown, np.nan, first[key])
-    if lost > _LOST_AT_MOST * scored:
-        raise ConfigError(f"comparison: {lost} of {scored} images have a label-free score before, but none after")
-    return compare_values(first, second, [LABEL_FREE_SCORE])
+    return compare_values(_label_free_values(before, cameras), _label_free_values(after, cameras), [LABEL_FREE_SCORE])
 
 
 def _label_free_values(result: EvaluationResult, cameras: Sequence[str]) -> SetValues:
