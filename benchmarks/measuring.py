@@ -8,6 +8,7 @@ for line in json_lines("cloud", timings, baseline="straightforward", sizes={"cam
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import importlib.metadata
 import json
@@ -21,7 +22,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-_PACKAGES = ("torch", "numpy", "opencv-python-headless")
+_PACKAGES = ("torch", "numpy", "opencv-python-headless", "ncnn", "onnxruntime")
 
 
 @dataclass
@@ -103,8 +104,15 @@ def circumstances(device: str = "cpu") -> dict[str, Any]:
         "load_average": round(os.getloadavg()[0], 1),
         "date": datetime.datetime.now(datetime.timezone.utc).strftime("%Y-%m-%d %H:%M"),
         "python": platform.python_version(),
-        "versions": {name: importlib.metadata.version(name) for name in _PACKAGES},
+        "versions": dict(installed_versions()),
     }
+
+
+def installed_versions() -> Iterator[tuple[str, str]]:
+    """Name those packages that the numbers depend on and that are installed."""
+    for name in _PACKAGES:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            yield name, importlib.metadata.version(name)
 
 
 def machine(device: str = "cpu") -> str:
