@@ -85,9 +85,9 @@ class ModelSettings(Settings):
 class MatchingSettings(Settings):
     """Which images make a surround set."""
 
-    tolerance: float = Field(0.1, gt=0, le=10)
+    tolerance: float = Field(default=0.1, gt=0, le=10)
     """Seconds that two images of one set may be apart."""
-    queue_size: int = Field(10, ge=2, le=1000)
+    queue_size: int = Field(default=10, ge=2, le=1000)
     """Images that are kept per camera while their set is not complete."""
 
 
