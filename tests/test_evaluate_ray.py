@@ -64,24 +64,6 @@ def evaluate(*arguments: str) -> list[str]:
     return ["evaluate", *arguments, *constant]
 
 
-def test_a_cluster_gives_exactly_the_files_of_one_worker(pool: Pool, drives: Path, tmp_path: Path):
-    """As another process does it that connects to the cluster by its address, relative paths included."""
-    import ray
-
-    address = ray.get_runtime_context().gcs_address
-    assert main(evaluate(str(drives), "-o", str(tmp_path / "one"))) == 0
-    program = [sys.executable, "-m", "cvcdepth_ros.bag_replay"]
-    command = [*program, *evaluate(".", "-o", str(tmp_path / "ray"), "--ray-address", address, "--json")]
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
-    done = subprocess.run(command, cwd=drives, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)["sets"] == 3
-    assert len(list((tmp_path / "ray" / "parts").iterdir())) == 2
-    metrics = [(tmp_path / name / "metrics.json").read_text() for name in ("one", "ray")]
-    assert metrics[0].replace(f"{drives}/", "") == metrics[1]
-    assert (tmp_path / "one" / "per_frame.csv").read_bytes() == (tmp_path / "ray" / "per_frame.csv").read_bytes()
-
-
 class DeadlyJob(EvaluationJob):
     """Whoever receives it dies at once, as a process does that the kernel kills for want of memory."""
 
@@ -112,6 +94,24 @@ def test_a_machine_with_another_checkpoint_at_that_path_is_named(pool: Pool, dri
     assert "sha256" in outcomes["a"].reason
     assert "expected" in outcomes["a"].reason
     assert "missing.safetensors: no such file" in outcomes["b"].reason
+
+
+def test_a_cluster_gives_exactly_the_files_of_one_worker(pool: Pool, drives: Path, tmp_path: Path):
+    """As another process does it that connects to the cluster by its address, relative paths included."""
+    import ray
+
+    address = ray.get_runtime_context().gcs_address
+    assert main(evaluate(str(drives), "-o", str(tmp_path / "one"))) == 0
+    program = [sys.executable, "-m", "cvcdepth_ros.bag_replay"]
+    command = [*program, *evaluate(".", "-o", str(tmp_path / "ray"), "--ray-address", address, "--json")]
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    done = subprocess.run(command, cwd=drives, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["sets"] == 3
+    assert len(list((tmp_path / "ray" / "parts").iterdir())) == 2
+    metrics = [(tmp_path / name / "metrics.json").read_text() for name in ("one", "ray")]
+    assert metrics[0].replace(f"{drives}/", "") == metrics[1]
+    assert (tmp_path / "one" / "per_frame.csv").read_bytes() == (tmp_path / "ray" / "per_frame.csv").read_bytes()
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "ray://127.0.0.1:1", "nowhere"])
