@@ -251,10 +251,10 @@ def test_without_tensorboard_a_line_says_so_once(config, tmp_path, capsys, monke
 
 
 def test_torchrun_trains_with_two_processes_as_one_does_with_their_samples(config, tmp_path):
-    path = config(
-        optimizer=SMALL["optimizer"] | {"samples_per_batch": 2}, recordings={"held_out": 0.0, "min_travel": 0.1}
-    )
+    everything = {"held_out": 0.0, "min_travel": 0.1}
+    path = config(optimizer=SMALL["optimizer"] | {"samples_per_batch": 2}, recordings=everything)
     assert finetune(path, tmp_path / "alone", *CHEAP) == NOT_PROMOTED
+    path = config(optimizer=SMALL["optimizer"], recordings=everything)
     torchrun = ["torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "cvcdepth_ros.bag_replay"]
     program = [sys.executable, "-m", *torchrun, *command(path, tmp_path / "both", "--json", *CHEAP)]
     finished = subprocess.run(program, capture_output=True, text=True, check=False)
