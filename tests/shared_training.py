@@ -15,12 +15,12 @@ from cvcdepth_core.training import Trainer, ValidationOutcome, build_surround_mo
 from cvcdepth_core.training_config import OptimizerConfig, PoseConfig, TrainingConfig
 
 SPEC = DepthModelSpec(encoder="efficientnet_lite0", height=64, width=64, min_depth=0.5, max_depth=80)
-SAMPLES = 10
+SAMPLES = 8
 UNREADABLE = 5
 
 
 class SharedBatches:
-    """Ten samples, two at a time through the networks of all processes; one sample cannot be read."""
+    """Eight samples, two at a time through the networks of all processes; one sample cannot be read."""
 
     def __init__(self, processes: Processes) -> None:
         self.samples = SAMPLES
