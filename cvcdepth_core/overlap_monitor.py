@@ -63,6 +63,8 @@ class MonitorLimits:
     """Relative depth difference of a pair above its usual one."""
     sharpness: float = 0.35
     """Loss of fine structure, as the natural logarithm of the ratio to the usual one."""
+    confirmation: float = 1.0
+    """Seconds for which a pair must be bad before cameras are named; by then the others of the same camera are too."""
     window: float = 2.0
     """Seconds over which a quantity is averaged before it is judged."""
     usual: float = 60.0
@@ -128,12 +130,14 @@ class OverlapMonitor:
         self._step = 0
         self._last_stamp: int | None = None
         self._findings: tuple[Finding, ...] = ()
+        self._bad_since: dict[Quantity, dict[tuple[int, int], int]] = {"misalignment": {}, "disagreement": {}}
 
     def update(self, surround: SurroundDepth, stamp_ns: int) -> None:
         """Take the next steps in one surround set. A stamp that goes back begins the recent seconds anew."""
         if self._last_stamp is not None and stamp_ns < self._last_stamp:
             for trend in (*self._correlations.values(), *self._disagreements.values(), *self._sharpness.values()):
                 trend.forget_recent()
+            self._bad_since = {"misalignment": {}, "disagreement": {}}
         self._last_stamp = stamp_ns
         for _ in range(self._steps_per_update):
             quantity, cameras = self._steps[self._step]
@@ -214,6 +218,10 @@ class OverlapMonitor:
         """Name the cameras all of whose judged pairs are above the limit; both of a pair that no camera explains."""
         judged = {pair: value for pair, value in values.items() if not math.isnan(value)}
         bad = {pair: value for pair, value in judged.items() if value > limit}
+        since = self._bad_since[quantity]
+        self._bad_since[quantity] = since = {pair: since.get(pair, stamp) for pair in bad}
+        if all(stamp - begin < self._limits.confirmation * NANOSECONDS for begin in since.values()):
+            return
         suspects = {c for pair in bad for c in pair if all(other in bad for other in judged if c in other)}
         while bad:
             # The camera that explains most is named first; its pairs then need no other explanation.
