@@ -17,7 +17,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -84,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     finally:
         graph.close()
     problems = soak.problems(min(300.0, options.minutes * 60 / 3))
-    result = asdict(soak) | {"problems": problems}
+    result = vars(soak) | {"problems": problems}
     options.output.parent.mkdir(parents=True, exist_ok=True)
     options.output.write_text(json.dumps(result, indent=1))
     faults = sum(soak.faults.values())
