@@ -136,7 +136,7 @@ FAULTS = {
     "sends JPEG that declares 65000 x 65000": Fault("65000x65000", _content(_declaring)),
     "sends PNG that declares 65000 x 65000": Fault("65000x65000", _content(lambda jpeg: _png(b"\0\0\xfd\xe8" * 2))),
     "sends PNG with a chunk of 2 GiB": Fault(
-        "it was cut", _content(lambda jpeg: _png(b"\0\0\0\x08" * 2, b"\x7f\xff\xff\xff"))
+        "it was cut", _content(lambda jpeg: _png(b"\0\0\x03\xc0\0\0\x02\x1c", b"\x7f\xff\xff\xff"))
     ),
     "sends JPEG with hundreds of scans": Fault("scans; at most 64", _content(_many_scans)),
     "changes its resolution": Fault("but its camera_info says 960x540", _content(_half_size)),
