@@ -27,8 +27,10 @@ from cvcdepth_core.networks import DepthNet
 from cvcdepth_core.reference_predictors import FixedDepth
 from cvcdepth_ros.bag_replay import main
 from cvcdepth_ros.commands import evaluate
+from cvcdepth_ros.evaluation.frames import LabelFree, SetScore
 from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings
 from cvcdepth_ros.evaluation.recording import RecordingScores, open_evaluation
+from cvcdepth_ros.evaluation.report.page import chosen_sets
 from cvcdepth_ros.evaluation.result import Failure
 from cvcdepth_ros.evaluation.workers import evaluate_all
 from cvcdepth_ros.replay import DepthReplay
@@ -212,6 +214,12 @@ def test_flat_ground_agrees_with_itself_far_better_than_a_wall_around_every_came
         for result in (flat, metrics_of(output))
     ]
     assert medians[0] < 0.03 < medians[1]
+
+
+def test_a_set_without_truth_is_not_shown_as_the_best_beside_sets_that_have_it():
+    sets = [SetScore("drive", number, 0, error, LabelFree(0.05)) for number, error in enumerate((0.3, math.nan, 0.2))]
+    assert [(title, found.number) for title, found in chosen_sets(sets)] == [("Median set", 2), ("Worst set", 0)]
+    assert [found.number for _, found in chosen_sets(sets[1:2])] == [1]
 
 
 # What is written

@@ -68,7 +68,8 @@ class EvaluationResult:
         scores = [outcome for outcome in found if not isinstance(outcome, Failure)]
         if not scores:
             raise RecordingError(f"nothing could be evaluated: {failed[0].reason}")
-        model = Model(scores[0].summary["model"], jobs[0].settings.checkpoint or None, depends_on.sha256)
+        path = jobs[0].settings.checkpoint_path
+        model = Model(scores[0].summary["model"], str(path) if path else None, depends_on.sha256)
         ordered = sorted(scores, key=lambda found: found.name)
         return cls(depends_on.version, model, jobs[0].configuration(), ordered, sorted(failed))
 

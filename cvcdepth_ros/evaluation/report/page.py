@@ -55,8 +55,12 @@ def write_report(path: Path, result: EvaluationResult, jobs: Mapping[str, Evalua
 
 
 def chosen_sets(sets: Sequence[SetScore]) -> list[tuple[str, SetScore]]:
-    """Return the best, the median and the worst set, each once; nothing where no set has any score."""
-    ranked = sorted((found for found in sets if not math.isnan(found.rank)), key=lambda found: found.rank)
+    """Return the best, the median and the worst set, each once; nothing where no set has any score.
+
+    Where some sets have truth, it is they that are ranked: an error and a disagreement cannot be compared.
+    """
+    with_truth = [found for found in sets if not math.isnan(found.abs_rel)]
+    ranked = sorted((f for f in with_truth or sets if not math.isnan(f.rank)), key=lambda found: found.rank)
     places = {"Best set": 0, "Median set": (len(ranked) - 1) // 2, "Worst set": len(ranked) - 1}
     by_place = {place: title for title, place in places.items()}
     return [(title, ranked[place]) for place, title in sorted(by_place.items()) if 0 <= place < len(ranked)]
