@@ -126,7 +126,7 @@ FAULTS = {
     "sends the same picture for ever": Fault("frozen", _frozen()),
     "stamps everything zero": Fault("frozen", _zero_stamp),
     "stamps an hour ahead": Fault("unmatched", _stamp(3600)),
-    "stamps an hour back": Fault("unmatched", _stamp(-900)),
+    "stamps a quarter of an hour back": Fault("unmatched", _stamp(-900)),
     "sends two bytes": Fault("neither JPEG nor PNG", _content(lambda jpeg: b"")),
     "sends HTML": Fault("neither JPEG nor PNG", _content(lambda jpeg: b"<html><script>alert(1)</script></html>")),
     "sends WebP": Fault("neither JPEG nor PNG", _content(lambda jpeg: b"RIFF\x10\0\0\0WEBPVP8 ")),
