@@ -14,7 +14,7 @@ from typing import Any
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
@@ -123,8 +123,10 @@ def record(
         try:
             while rclpy.ok() and time.monotonic() - recorder.last_message < idle_seconds:
                 executor.spin_once(timeout_sec=_SPIN_SECONDS)
-        except ExternalShutdownException:
-            pass
+        except Exception:
+            # A signal invalidates the context at once, also just before rclpy waits with it.
+            if rclpy.ok():
+                raise
         # A second signal must not cut the file.
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_IGN)
