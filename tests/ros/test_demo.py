@@ -258,7 +258,7 @@ def test_the_recorder_stores_every_message_until_it_is_interrupted(tmp_path: Pat
 
 @pytest.mark.usefixtures("publisher")
 def test_the_recorder_ends_by_itself_when_only_diagnostics_come(tmp_path: Path, environment: dict[str, str]):
-    recorder = start_recorder(tmp_path / "out", environment, "--idle-seconds", "3")
+    recorder = start_recorder(tmp_path / "out", environment, "--idle-seconds", "10")  # discovery takes its time too
     output, _ = recorder.communicate(timeout=TIMEOUT)
     assert recorder.returncode == 0
     assert json.loads(output.splitlines()[-1])["received"][f"{NODE}/front/image_rect"] == 20
