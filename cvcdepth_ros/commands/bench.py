@@ -112,7 +112,7 @@ def _figures(paths: "DemoPaths", anchor: str, info: str, outcome: "LiveOutcome")
     median = float(np.median(intervals))
     return {
         "engine": outcome.node.model,
-        "sets_sent": len(sent),
+        "sets_sent": outcome.sent[info],  # the recorder may miss the first
         "sets_received": len(depth),
         "median_ms": round(median, 2),
         "p95_ms": round(float(np.percentile(intervals, 95)), 2),

@@ -214,10 +214,10 @@ def test_the_log_does_not_repeat_a_lasting_fault_for_every_image(scene: Scene):
     before = scene.graph.log().count(reason)
     scene.fail(left=_content(lambda jpeg: b"rubbish"))
     scene.await_state("left", reason)
-    for _ in range(20):
+    for _ in range(100):
         scene.cameras.cycle()
         scene.graph.spin(0.05)
-    assert 1 <= scene.graph.log().count(reason) - before < 8
+    assert 1 <= scene.graph.log().count(reason) - before < 50
     scene.recover()
 
 
