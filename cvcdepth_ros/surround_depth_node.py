@@ -155,11 +155,15 @@ class SurroundDepthNode(LifecycleNode):  # type: ignore[misc] # rclpy is not ann
     def _report(self, conditions: dict[str, CameraCondition]) -> None:
         """Log what is wrong with each camera once, when it begins, and its end."""
         for camera, condition in conditions.items():
-            if condition != self._reported.get(camera, _FINE):
-                if condition == _FINE:  # rclpy wants every line of code to log with one severity
-                    self.get_logger().info(f"camera {camera}: ok")
-                else:
-                    self.get_logger().warning(f"camera {camera}: {condition.text}")
+            former = self._reported.get(camera, _FINE)
+            if condition == former:
+                continue
+            if condition == _FINE:  # rclpy wants every line of code to log with one severity
+                self.get_logger().info(f"camera {camera}: ok")
+            elif condition.state != former.state:
+                self.get_logger().warning(f"camera {camera}: {condition.text}")
+            else:  # the reason may be another with every image
+                self.get_logger().warning(f"camera {camera}: {condition.text}", throttle_duration_sec=5.0)
         self._reported = conditions
 
     def _report_refusals(self, count: int, reason: str) -> None:
