@@ -185,6 +185,7 @@ class SmallMemory:
 
     name = "small"
     device = torch.device("meta")
+    chunk = None
 
     def __init__(self, room: int, error: type[Exception] = DeviceMemoryError) -> None:
         self.room, self.error, self.tried = room, error, []
@@ -225,6 +226,17 @@ def test_no_memory_on_the_fallback_either_is_an_error():
     engine = ChunkedEngine(SmallMemory(0), fallback=lambda: SmallMemory(0))
     with pytest.raises(EngineError, match="out of memory"):
         engine.disparity(random_images(2))
+
+
+@needs_ncnn
+def test_ncnn_gives_the_same_depth_on_any_number_of_threads(monkeypatch: pytest.MonkeyPatch):
+    images, found = random_images(5), []
+    for threads in (1, 4):
+        monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
+        engine = build_engine(lively_network("resnet18"), spec_of("resnet18"), "cpu", "ncnn")
+        one_by_one = torch.cat([engine.disparity(image[None]) for image in images])
+        found += [one_by_one, engine.disparity(images), engine.disparity(images[:2])]
+    assert all(torch.equal(disparity, found[0][: len(disparity)]) for disparity in found)
 
 
 @needs_ncnn

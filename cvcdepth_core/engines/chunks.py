@@ -13,17 +13,15 @@ from cvcdepth_core.errors import EngineError
 
 
 class ChunkedEngine:
-    """Runs an engine on chunks of images: one by one on a CPU, on a GPU as many as its memory takes.
+    """Runs an engine on chunks of images: as many as it takes best, on a GPU as many as its memory takes."""
 
-    One by one, a camera's depth depends on no other camera, to the last bit; it is also quicker than all at once, for
-    the feature maps of one stay in the cache.
-    """
+    chunk = None
 
     def __init__(self, engine: DisparityEngine, fallback: Callable[[], DisparityEngine] | None = None) -> None:
         """`fallback` builds the engine to go on with when the device has too little memory even for one image."""
         self._engine = engine
         self._fallback = fallback
-        self._chunk = _first_chunk(engine)
+        self._chunk = engine.chunk
 
     @property
     def name(self) -> str:
@@ -57,8 +55,4 @@ class ChunkedEngine:
                 f"{self.name}: out of memory on {self.device} with a single image: {str(error).splitlines()[0]}"
             ) from error
         self._engine, self._fallback = self._fallback(), None
-        self._chunk = _first_chunk(self._engine)
-
-
-def _first_chunk(engine: DisparityEngine) -> int | None:
-    return 1 if engine.device.type == "cpu" else None
+        self._chunk = self._engine.chunk

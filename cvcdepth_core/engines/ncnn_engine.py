@@ -4,7 +4,10 @@
 from __future__ import annotations
 
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,28 +20,34 @@ from cvcdepth_core.networks import DepthNet
 
 
 class NcnnEngine:
-    """The rewritten network in NCNN, on as many threads as torch has when it is built."""
+    """The rewritten network in NCNN, on as many threads as torch has when it is built.
+
+    Several images are computed side by side: NCNN's own threads wait for each other in every layer.
+    """
 
     device = torch.device("cpu")
+    chunk = None
 
     def __init__(self, network: DepthNet) -> None:
         import ncnn
 
         self._ncnn = ncnn
         self.name = f"ncnn {ncnn.__version__} float32"
-        self._net = ncnn.Net()
-        self._net.opt.num_threads = torch.get_num_threads()
-        # Where a CPU or GPU could compute in 16 bits, NCNN would.
-        for option in ("fp16_packed", "fp16_storage", "fp16_arithmetic", "bf16_storage", "vulkan_compute"):
-            setattr(self._net.opt, f"use_{option}", False)
-        self._load(*ncnn_model(RewrittenDepthNet(network, transposed=False)))
+        self._threads = self._threads_per_image = torch.get_num_threads()
+        self._pool = ThreadPoolExecutor(self._threads, "ncnn")
+        self._model = ncnn_model(RewrittenDepthNet(network, transposed=False))
+        self._net = self._load()
 
     def disparity(self, images: Tensor) -> Tensor:
-        """See `DisparityEngine`."""
-        return torch.from_numpy(np.stack([self._one(image) for image in images.numpy()]))
+        """See `DisparityEngine`. The largest set so far decides how many threads each image has."""
+        threads = max(1, self._threads // len(images))
+        if threads < self._threads_per_image:
+            self._threads_per_image = threads
+            self._net = self._load()
+        return torch.from_numpy(np.stack(list(self._pool.map(partial(self._one, self._net), images.numpy()))))
 
-    def _one(self, image: np.ndarray) -> np.ndarray:
-        extractor = self._net.create_extractor()
+    def _one(self, net: Any, image: np.ndarray) -> np.ndarray:
+        extractor = net.create_extractor()
         # A Mat made from an array neither owns nor keeps it; a clone has memory of its own.
         extractor.input(INPUT, self._ncnn.Mat(np.ascontiguousarray(image)).clone())
         failed, disparity = extractor.extract(OUTPUT)
@@ -46,12 +55,21 @@ class NcnnEngine:
             raise EngineError(f"{self.name}: inference failed with code {failed} on an image of {image.shape}")
         return np.array(disparity)
 
-    def _load(self, param: str, weights: bytes) -> None:
-        """NCNN reads memory only if it outlives the network, so it is given files."""
+    def _load(self) -> Any:
+        """Return the network for so many threads an image, which NCNN lays its weights out for.
+
+        NCNN reads memory only if it outlives the network, so it is given files.
+        """
+        net = self._ncnn.Net()
+        net.opt.num_threads = self._threads_per_image
+        # Where a CPU or GPU could compute in 16 bits, NCNN would.
+        for option in ("fp16_packed", "fp16_storage", "fp16_arithmetic", "bf16_storage", "vulkan_compute"):
+            setattr(net.opt, f"use_{option}", False)
         with tempfile.TemporaryDirectory(prefix="cvcdepth_ncnn_") as folder:
             param_file, weights_file = Path(folder, "param"), Path(folder, "bin")
-            param_file.write_text(param, encoding="ascii")
-            weights_file.write_bytes(weights)
-            failed = self._net.load_param(str(param_file)) or self._net.load_model(str(weights_file))
+            param_file.write_text(self._model[0], encoding="ascii")
+            weights_file.write_bytes(self._model[1])
+            failed = net.load_param(str(param_file)) or net.load_model(str(weights_file))
         if failed:
             raise EngineError(f"{self.name}: cannot load the network, code {failed}")
+        return net

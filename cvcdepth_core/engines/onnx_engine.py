@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from cvcdepth_core.checkpoint import DepthModelSpec
-from cvcdepth_core.engines.engine import DeviceMemoryError, Precision
+from cvcdepth_core.engines.engine import DeviceMemoryError, Precision, best_chunk
 from cvcdepth_core.engines.rewriting import RewrittenDepthNet
 from cvcdepth_core.errors import EngineError
 from cvcdepth_core.networks import DepthNet
@@ -62,6 +62,7 @@ class OnnxRuntimeEngine:
         provider = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}[device.type]
         options = {"device_id": device.index or 0} if device.type == "cuda" else {}
         self.device = device
+        self.chunk = best_chunk(device)
         self.name = f"onnxruntime {onnxruntime.__version__} {device.type} float32"
         self.model = onnx_model(network, spec)
         self._session = _session(self.model, [(provider, options)])
@@ -86,6 +87,7 @@ class TensorRtEngine:
         import onnxruntime
 
         self.device = device
+        self.chunk = best_chunk(device)
         self.name = f"tensorrt of onnxruntime {onnxruntime.__version__} {precision}"
         folder = engine_folder(network, spec, device, precision)
         if not build and not any(folder.glob("*.engine")):

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from cvcdepth_core.engines.engine import Precision
+from cvcdepth_core.engines.engine import Precision, best_chunk
 from cvcdepth_core.engines.rewriting import RewrittenDepthNet
 from cvcdepth_core.networks import DepthNet
 
@@ -20,6 +20,7 @@ class TorchEagerEngine:
     def __init__(self, network: DepthNet, device: torch.device) -> None:
         self.name = f"torch_eager {torch.__version__}"
         self.device = device
+        self.chunk = best_chunk(device)
         self._network = copy.deepcopy(network).eval().to(device)
 
     @torch.inference_mode()
@@ -37,6 +38,7 @@ class TorchEngine:
     ) -> None:
         self.name = f"{'torch_compiled' if compiled else 'torch'} {torch.__version__} {precision}"
         self.device = device
+        self.chunk = best_chunk(device)
         mixed = MixedPrecision(RewrittenDepthNet(network), getattr(torch, precision))
         mixed = mixed.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._run: Callable[[Tensor], Tensor] = CudaGraphs(torch.compile(mixed, dynamic=False)) if compiled else mixed
