@@ -25,7 +25,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo bench test lint test-ros test-core tf2_msgs lock clean
+.PHONY: help demo bench test lint test-ros test-core test-faults fuzz soak tf2_msgs lock clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z0-9_-]*\):.* ## /\1\t/p' Makefile | expand -t 12
@@ -39,7 +39,12 @@ bench: $(DEV) ## run every benchmark, half an hour on a quiet machine; its table
 		echo "$$name ..." && .venv/bin/python benchmarks/$$name.py > output/bench/$$name.jsonl || exit 1; done
 	.venv/bin/python benchmarks/table.py $(BENCHMARKS:%=output/bench/%.jsonl)
 
-test: lint test-ros test-core ## everything that CI runs
+# The soak mostly waits, and asserts nothing about time.
+test: lint test-ros ## everything that CI runs: lint, all tests, and three minutes of soak beside the slow ones
+	@mkdir -p output; .venv/bin/python tools/soak.py --minutes 3 --output output/soak_short.json \
+	  >output/soak_short.log 2>&1 & soak=$$!; \
+	$(MAKE) test-core; tests=$$?; wait $$soak; soaked=$$?; \
+	echo "soak: $$(tail -n 1 output/soak_short.log)"; exit $$((tests | soaked))
 
 lint: $(DEV) ## ruff and mypy
 	.venv/bin/ruff check .

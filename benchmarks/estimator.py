@@ -6,7 +6,8 @@
 Each engine has a process of its own, whose peak memory it is, and they take turns. The baseline is ResNet-18 at
 6 x 384 x 640 as torch runs it: all cameras as one batch, operation by operation, float32. `times_eager` compares with
 the same for the same network and size. The engines run in processes set up like those of node and bag tool, which keep
-freed buffers (`prepare_process`); "buffers kept" is the baseline in such a process. Weights are random: they change nothing about the speed.
+freed buffers (`prepare_process`); "buffers kept" is the baseline in such a process. Weights are random: they change
+nothing about the speed.
 """
 
 from __future__ import annotations

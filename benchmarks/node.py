@@ -29,9 +29,7 @@ def main() -> None:
     parser.add_argument("--height", type=int, default=192)
     parser.add_argument("--width", type=int, default=320)
     parser.add_argument("--seconds", type=float, default=20.0)
-    parser.add_argument(
-        "--rate", type=float, default=2.0, help="of the recording's 10 Hz; more than the node does, to measure it"
-    )
+    parser.add_argument("--rate", type=float, default=2.0, help="times 10 Hz: faster than the node is")
     options = parser.parse_args()
     result = measured(options)
     sizes = {"network": options.encoder, "picture": f"{options.height}x{options.width}", "rate": options.rate}

@@ -26,6 +26,7 @@ from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from cvcdepth_core.calibration import scale_intrinsics
@@ -39,6 +40,7 @@ Quantity = Literal["misalignment", "disagreement", "sharpness"]
 NANOSECONDS = 10**9
 _WORKING_WIDTH = 320
 _POINTS = 200
+_CANDIDATES = 4000  # enough for _POINTS in an overlap of a tenth of the picture
 _LEAST_POINTS = 60
 _TURNS_DEG = np.arange(-8, 9) * 0.25
 _MARGIN = 3
@@ -215,13 +217,15 @@ class OverlapMonitor:
     def _named(
         self, quantity: Quantity, values: dict[tuple[int, int], float], limit: float, stamp: int
     ) -> Iterable[Finding]:
-        """Name the cameras all of whose judged pairs are above the limit; both of a pair that no camera explains."""
+        """Name the cameras all of whose judged pairs are above the limit; both of a pair that no camera explains.
+
+        One pair that has been so for long enough confirms them; another camera's pair does not.
+        """
         judged = {pair: value for pair, value in values.items() if not math.isnan(value)}
         bad = {pair: value for pair, value in judged.items() if value > limit}
         since = self._bad_since[quantity]
         self._bad_since[quantity] = since = {pair: since.get(pair, stamp) for pair in bad}
-        if all(stamp - begin < self._limits.confirmation * NANOSECONDS for begin in since.values()):
-            return
+        confirmed = {p for p, begin in since.items() if stamp - begin >= self._limits.confirmation * NANOSECONDS}
         suspects = {c for pair in bad for c in pair if all(other in bad for other in judged if c in other)}
         while bad:
             # The camera that explains most is named first; its pairs then need no other explanation.
@@ -232,7 +236,8 @@ class OverlapMonitor:
             named = named if len(named) == 1 or most == 1 else named[:1]
             explained = {other: v for other, v in bad.items() if set(other) & set(named)} or {pair: value}
             names = tuple(self._names[c] for c in named)
-            yield self._finding(quantity, names, max(explained.values()), stamp)
+            if confirmed & explained.keys():
+                yield self._finding(quantity, names, max(explained.values()), stamp)
             bad = {other: v for other, v in bad.items() if other not in explained}
 
     def _finding(self, quantity: Quantity, names: tuple[str, ...], value: float, stamp: int) -> Finding:
@@ -320,9 +325,8 @@ def _correlations(view: _View, other: _View, other_T_view: NDArray[np.float64]) 
     points, structure = _overlapping_points(view, other, other_T_view)
     if len(points) < _LEAST_POINTS:
         return None
-    rays = points @ _TURNS  # [turns, M, 3]
-    pixels = (rays[..., :2] / rays[..., 2:]) @ other.intrinsics[:2, :2].T + other.intrinsics[:2, 2]
-    u, v = (pixels[..., axis].astype(np.float32) for axis in (0, 1))
+    pixels = points @ (_TURNS @ other.intrinsics.T.astype(np.float32))  # [turns, M, 3], homogeneous
+    u, v = (np.ascontiguousarray(pixels[..., axis]) / pixels[..., 2] for axis in (0, 1))
     seen = cv2.remap(other.structure, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
     norm = np.sqrt((seen * seen).sum(axis=1) * (structure @ structure)) + 1e-6
     correlation: NDArray[np.float64] = (seen @ structure / norm).astype(np.float64)
@@ -333,7 +337,8 @@ def _overlapping_points(
     view: _View, other: _View, other_T_view: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return points [M, 3] of the view that the other one sees, in metres in its frame, and their structure [M]."""
-    v, u = np.nonzero(np.abs(view.structure) > _CONTRAST)
+    contrasts = np.flatnonzero(np.abs(view.structure) > _CONTRAST)
+    v, u = np.divmod(contrasts[:: max(1, len(contrasts) // _CANDIDATES)], view.structure.shape[1])
     z = view.depth[v, u]
     rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(view.intrinsics).T
     points = (rays * z[:, None]) @ other_T_view[:3, :3].T + other_T_view[:3, 3]
@@ -388,19 +393,30 @@ def _change_of_turn(trend: _Trend) -> float:
     """
     if trend.now is None or trend.usual is None or min(trend.now.max(), trend.usual.max()) < _LEAST_CORRELATION:
         return math.nan
-    likeness = np.array([[_likeness(trend.now, trend.usual, rows, columns) for columns in _SHIFTS] for rows in _SHIFTS])
+    likeness = _likeness(trend.now, trend.usual)
     row, column = np.unravel_index(int(likeness.argmax()), likeness.shape)
     offsets = (_peak_offset(likeness[:, column], int(row)), _peak_offset(likeness[row], int(column)))
     steps = np.hypot(_SHIFTS[row] + offsets[0], _SHIFTS[column] + offsets[1])
     return float(steps * (_TURNS_DEG[1] - _TURNS_DEG[0]))
 
 
-def _likeness(now: NDArray[np.float64], usual: NDArray[np.float64], rows: int, columns: int) -> float:
-    """Mean squared difference, negated, of the part that both show when `now` is moved back by rows and columns."""
-    a = now[max(rows, 0) : len(now) + min(rows, 0), max(columns, 0) : len(now) + min(columns, 0)]
-    b = usual[max(-rows, 0) : len(now) + min(-rows, 0), max(-columns, 0) : len(now) + min(-columns, 0)]
-    difference = (a - a.mean()) - (b - b.mean())
-    return -float(np.square(difference).mean())
+def _likeness(now: NDArray[np.float64], usual: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return for every shift of `now` (rows, columns) how like `usual` it is: their mean squared difference, negated.
+
+    Only what both show at that shift counts, without its mean.
+    """
+    a, b = _shifted(now), usual.ravel()
+    count = _SHOWN.sum(axis=1)
+    squares = np.square(a).sum(axis=1) + _SHOWN @ np.square(b) - 2 * a @ b
+    differences = squares - np.square(a.sum(axis=1) - _SHOWN @ b) / count
+    likeness: NDArray[np.float64] = -(differences / count).reshape(len(_SHIFTS), len(_SHIFTS))
+    return likeness
+
+
+def _shifted(grid: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the grid [S, S] under every shift, a row each [shifts, S * S]; 0 where it shows nothing."""
+    padded = np.pad(grid, _SHIFTS[-1])
+    return sliding_window_view(padded, grid.shape).reshape(-1, grid.size)
 
 
 def _excess(state: PairState, limits: MonitorLimits) -> float:
@@ -428,4 +444,5 @@ def _turn(pitch: float, yaw: float) -> NDArray[np.float32]:
     return turn
 
 
+_SHOWN = _shifted(np.ones((len(_TURNS_DEG), len(_TURNS_DEG))))
 _TURNS = np.stack([_turn(pitch, yaw) for pitch, yaw in product(_TURNS_DEG, _TURNS_DEG)])

@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict
 
 DIAGNOSTICS_TOPIC = "/diagnostics"
 
+_PERCENTILES = ("p50", "p95", "max")
 _ERROR = 2  # diagnostic_msgs/DiagnosticStatus.ERROR
 _LOST = "lost in transport"
 _DROPPED = "dropped: "
@@ -17,12 +18,13 @@ _NO_REASONS = ("matched", "received", "delivered", "published")
 
 
 class Latency(BaseModel):
-    """One stage's percentiles over the last sets, in milliseconds."""
+    """One stage's percentiles over the last 1000 sets, in milliseconds."""
 
     model_config = ConfigDict(frozen=True)
 
     p50_ms: float
     p95_ms: float
+    max_ms: float
 
 
 class NodeReport(BaseModel):
@@ -103,4 +105,4 @@ def _summed(cameras: Mapping[str, Mapping[str, str]]) -> dict[str, int]:
 
 def _latencies(values: Mapping[str, str]) -> dict[str, Latency]:
     stages = [key.removesuffix(" p50 (ms)") for key in values if key.endswith(" p50 (ms)")]
-    return {s: Latency(p50_ms=float(values[f"{s} p50 (ms)"]), p95_ms=float(values[f"{s} p95 (ms)"])) for s in stages}
+    return {s: Latency(**{f"{kind}_ms": float(values[f"{s} {kind} (ms)"]) for kind in _PERCENTILES}) for s in stages}

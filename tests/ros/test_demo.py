@@ -320,7 +320,7 @@ def test_the_nodes_diagnostics_are_read_as_it_writes_them():
     assert (report.matched, report.published, report.dropped) == (10, 8, {"replaced": 2})
     assert report.images_lost == {"front": 3, "back": 3}
     assert report.images_dropped == {"unmatched": 2, "duplicate_stamp": 2}
-    assert report.latencies == {"inference": Latency(p50_ms=20, p95_ms=29)}
+    assert report.latencies == {"inference": Latency(p50_ms=20, p95_ms=29, max_ms=30)}
     assert (report.model, report.error) == ("a model", "")
 
 
