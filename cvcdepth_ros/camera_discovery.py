@@ -4,6 +4,7 @@
 A camera is a namespace with a `camera_info` and at least one image topic (image_pipeline's convention).
 """
 
+import re
 from collections.abc import Mapping
 
 from cvcdepth_core.rig import CameraEntry
@@ -54,16 +55,17 @@ def _image_topics(namespace: str, topic_types: Mapping[str, str]) -> list[str]:
 
 
 def _shortest_unique_names(namespaces: list[str]) -> dict[str, str]:
-    """Call each camera by the last part of its namespace, or by more parts where that is not unique."""
+    """Call each camera by the last part of its namespace, by more parts where that is not unique, else numbered."""
     parts = {namespace: namespace.strip("/").split("/") for namespace in namespaces}
     depth = max((len(found) for found in parts.values()), default=1)
     for count in range(1, depth + 1):
         names = {namespace: _camera_name("_".join(found[-count:])) for namespace, found in parts.items()}
         if len(set(names.values())) == len(names):
-            break
-    return names
+            return names
+    return {namespace: f"{name}_{number}" for number, (namespace, name) in enumerate(names.items())}
 
 
 def _camera_name(topic_part: str) -> str:
-    """Make a camera's name, which begins with a letter, of a part of a topic, which may be empty or a number."""
-    return topic_part if topic_part[:1].isalpha() else f"camera_{topic_part}".rstrip("_")
+    """Make a camera's name of a part of a topic, which may be empty, a number, or of no ROS system's characters."""
+    name = re.sub(r"[^A-Za-z0-9_]", "_", topic_part)
+    return name if name[:1].isalpha() else f"camera_{name}".rstrip("_")

@@ -23,6 +23,8 @@ def topics(*namespaces: str, **images: str) -> dict[str, str]:
         (["/front/camera", "/back/camera"], {"front_camera", "back_camera"}),
         (["/sensors/0", "/sensors/1"], {"camera_0", "camera_1"}),
         ([""], {"camera"}),
+        (["/front-left", "/é", "/a\0b"], {"front_left", "camera", "a_b"}),
+        (["/a-b", "/a_b"], {"a_b_0", "a_b_1"}),
     ],
 )
 def test_cameras_are_called_by_the_shortest_names_that_tell_them_apart(namespaces, names):

@@ -8,11 +8,11 @@ from pathlib import Path
 from urllib.parse import quote
 
 from cvcdepth_core.errors import RecordingError
-from cvcdepth_ros.bags.topics import RecordedMessage, RecordingFile, Topic, joined_topics, recorded_qos
+from cvcdepth_ros.bags.topics import RecordedMessage, RecordingFile, Topic, error_text, joined_topics, recorded_qos
 
 MAGIC = b"SQLite format 3\0"
-# What sqlite3 raises on damaged bytes, also where it reports an error whose text is not UTF-8.
-_DAMAGE = (sqlite3.Error, UnicodeDecodeError, OverflowError)
+# What sqlite3 raises on damaged bytes, also for an error whose text is not UTF-8 and for a length beyond all memory.
+_DAMAGE = (sqlite3.Error, UnicodeDecodeError, OverflowError, MemoryError)
 _TABLES = ("topics", "messages", "message_definitions")
 
 
@@ -33,7 +33,7 @@ class SqliteFile(RecordingFile):
                     "SELECT MIN(timestamp), MAX(timestamp) FROM messages"
                 ).fetchone()
         except _DAMAGE as error:
-            raise RecordingError(f"{path}: not readable as a rosbag2 database: {error}") from error
+            raise RecordingError(f"{path}: not readable as a rosbag2 database: {error_text(error)}") from error
         if not isinstance(self.start, int | None) or not isinstance(self.end, int | None):
             raise RecordingError(f"{path}: timestamps from {self.start!r:.40} to {self.end!r:.40} are not integers")
 
