@@ -16,7 +16,7 @@ TF2 := .venv/installed/tf2_msgs-$(shell cat tests/tf2_msgs/*.* tests/tf2_msgs/ms
 # Two tests at a time. A file's tests mostly stay in one process, which has the results that they share.
 BESIDE := -n 2 --dist worksteal
 
-BENCHMARKS := $(filter-out measuring table,$(basename $(notdir $(wildcard benchmarks/*.py))))
+BENCHMARKS := $(filter-out measuring table camera_loop,$(basename $(notdir $(wildcard benchmarks/*.py))))
 
 # A sourced ROS 2 installation must not leak into the wheels' environment, and nothing here talks to other machines.
 unexport PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH CMAKE_PREFIX_PATH LD_LIBRARY_PATH RMW_IMPLEMENTATION ROS_DISTRO

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Time and memory of one full training step: networks, every term, backward, optimiser. Prints JSON lines.
 
-The baseline is the whole step; the other lines are its parts. Where others use the machine, read the CPU times.
+The baseline is the same step with one view computed after the other (camera_loop.py); they take turns. "networks" and
+"objective" are the parts of our step. Where others use the machine, read the CPU times.
 
 python benchmarks/training_step.py --samples 1
 python benchmarks/training_step.py --device cuda --bf16 --samples 4
@@ -17,6 +18,7 @@ from typing import TypeVar
 
 import numpy as np
 import torch
+from camera_loop import loss_one_by_one, predict_one_by_one
 from measuring import Timings, json_lines, peak_memory_mb, print_line
 from numpy.typing import NDArray
 from torch import Tensor
@@ -31,6 +33,7 @@ Seconds = NDArray[np.float64]
 """[wall, CPU]."""
 
 CAMERAS = 6
+BASELINE = "camera loop"
 PARTS = ("step", "networks", "objective")
 RING_ORDER = (0, 2, 4, 5, 3, 1)  # front, front-right, back-right, back, back-left, front-left
 
@@ -43,7 +46,7 @@ def main() -> None:
     batch = ring_of_cameras(options.samples, options.height, options.width).to(options.device)
     timings = measure(options, batch)
     sizes = {name: value for name, value in vars(options).items() if name not in ("steps", "threads")}
-    for line in json_lines("training_step", timings, "step", sizes, options.device):
+    for line in json_lines("training_step", timings, BASELINE, sizes, options.device):
         print_line(line | {"peak_memory_mb": round(peak_memory_mb(options.device)), "threads": torch.get_num_threads()})
 
 
@@ -71,9 +74,36 @@ def measure(options: argparse.Namespace, batch: RigBatch) -> dict[str, Timings]:
     ).to(options.device)
     config = ObjectiveConfig(pose_consistency=0.1 if options.pose_method == "per_camera" else 0.0)
     optimizer = torch.optim.Adam(model.parameters(), lr=1e-4)
-    steps = [timed_step(options, model, batch, config, optimizer) for _ in range(options.steps + 1)][1:]
-    columns = {name: np.stack(column).T.tolist() for name, column in zip(PARTS, zip(*steps, strict=True), strict=True)}
+    steps = [
+        (
+            timed_loop_step(options, model, batch, config, optimizer),
+            *timed_step(options, model, batch, config, optimizer),
+        )
+        for _ in range(options.steps + 1)
+    ][1:]
+    names = (BASELINE, *PARTS)
+    columns = {name: np.stack(column).T.tolist() for name, column in zip(names, zip(*steps, strict=True), strict=True)}
     return {name: Timings(wall, cpu) for name, (wall, cpu) in columns.items()}
+
+
+def timed_loop_step(
+    options: argparse.Namespace,
+    model: SurroundModel,
+    batch: RigBatch,
+    config: ObjectiveConfig,
+    optimizer: torch.optim.Optimizer,
+) -> Seconds:
+    """Return seconds for the whole step of the baseline."""
+
+    def step() -> None:
+        optimizer.zero_grad(set_to_none=True)
+        with torch.autocast(batch.frames.device.type, torch.bfloat16, enabled=options.bf16):
+            prediction = predict_one_by_one(model, batch)
+        noise = torch.randn_like(batch.contexts[:, :, :, :1])
+        loss_one_by_one(batch, prediction, config, noise).backward()  # type: ignore[no-untyped-call]
+        optimizer.step()
+
+    return timed(options, step)[1]
 
 
 def timed_step(
