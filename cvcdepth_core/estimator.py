@@ -144,6 +144,10 @@ class SurroundDepthEstimator:
             rig, estimator.spec.height, estimator.spec.width, known.preprocessor if known else None
         )
 
+    def warm_up(self) -> None:
+        """Estimate black pictures, so that what an engine does but once for so many cameras is done."""
+        self.estimate(list(np.zeros((*self.preprocessor.valid.shape, 3), np.uint8)))
+
     def estimate(self, rectified: Sequence[Picture | None]) -> SurroundDepth:
         """Estimate one set from its rectified pictures [H, W, 3] in the rig's order, None where none is wanted.
 

@@ -71,6 +71,8 @@ class SurroundPipeline:
         self._latencies = latencies
         self._surround: Future[SurroundDepthEstimator] | None = None
         self._pace = _InferencePace()
+        self._warm_up = threading.Lock()
+        self._is_warm = False
         self._preparer = PicturePreparer(len(watches))
         self._estimates: queue.Queue[PublishedSet | None] = queue.Queue(maxsize=1)
         self.problem = ""
@@ -98,7 +100,7 @@ class SurroundPipeline:
         if rig is None:
             self._surround = None
         else:
-            self._surround = self._preparer.pool.submit(_surround_estimator, rig, self._estimator, former)
+            self._surround = self._preparer.pool.submit(self._build_surround, rig, self._estimator, former)
 
     def set_model(self, estimator: DepthPredictor) -> None:
         """Use another network from the next set on; its maps are built here, while the former one still runs."""
@@ -134,6 +136,18 @@ class SurroundPipeline:
         # An image whose set will be replaced before the network is free need not be decoded.
         if rectifier is not None and self._pace.is_free_within(self._watches[image.camera].interval):
             self._preparer.prepare(image, rectifier)
+
+    def _build_surround(
+        self, rig: Rig, estimator: DepthPredictor, former: Future[SurroundDepthEstimator] | None
+    ) -> SurroundDepthEstimator:
+        """Build the maps, taking over those of the cameras that have not changed; at first, warm the network up."""
+        known = former.result() if former is not None and former.done() and not former.exception() else None
+        surround = SurroundDepthEstimator(rig, estimator, known)
+        with self._warm_up:
+            if not self._is_warm:
+                surround.warm_up()
+                self._is_warm = True
+        return surround
 
     def _estimate_sets(self) -> None:
         while not self._mailbox.closed:
@@ -221,11 +235,3 @@ class _InferencePace:
     def is_free_within(self, seconds: float) -> bool:
         """Whether the running inference, if any, should be over in so many seconds."""
         return self._busy_until - time.monotonic() <= seconds
-
-
-def _surround_estimator(
-    rig: Rig, estimator: DepthPredictor, former: Future[SurroundDepthEstimator] | None
-) -> SurroundDepthEstimator:
-    """Build the maps, taking over those of the cameras that have not changed."""
-    known = former.result() if former is not None and former.done() and not former.exception() else None
-    return SurroundDepthEstimator(rig, estimator, known)

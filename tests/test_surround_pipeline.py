@@ -50,7 +50,7 @@ def estimator():
 
 
 class Slowed:
-    """A depth predictor that waits until it is told to go on."""
+    """A depth predictor that waits until it is told to go on, but not with the black pictures that warm it up."""
 
     def __init__(self, predictor: DepthEstimator) -> None:
         self.spec, self.model_id = predictor.spec, predictor.model_id
@@ -58,8 +58,12 @@ class Slowed:
         self.gate = threading.Event()
         self.entered = threading.Event()
         self.cameras: list[int] = []
+        self.warmed_up: list[int] = []
 
     def estimate(self, pictures: Any, fx: Any) -> Any:
+        if not np.any(pictures):
+            self.warmed_up.append(len(pictures))
+            return self._predictor.estimate(pictures, fx)
         self.cameras.append(len(pictures))
         self.entered.set()
         assert self.gate.wait(TIMEOUT)
@@ -122,6 +126,18 @@ def test_what_comes_out_is_what_the_bag_tool_computes_to_the_bit(start, estimato
     expected = estimate_set(messages, surround, StageLatencies(), required=6)
     np.testing.assert_array_equal(first.depth.depth, expected.depth)
     np.testing.assert_array_equal(first.depth.pictures, expected.pictures)
+
+
+def test_the_network_is_warmed_up_once_and_not_with_a_real_set(start, estimator, layout, images):
+    slowed = Slowed(estimator)
+    running = start(slowed)
+    running.pipeline.set_rig(layout.complete())
+    running.wait(lambda: slowed.warmed_up)
+    slowed.gate.set()
+    running.feed(images[:12])
+    running.wait(lambda: running.published)
+    assert slowed.warmed_up == [6]
+    assert set(slowed.cameras) == {6}
 
 
 def test_while_the_network_is_busy_only_the_newest_set_waits(start, estimator, images):
