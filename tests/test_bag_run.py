@@ -23,6 +23,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 
 from cvcdepth_ros.bag_replay import main
+from cvcdepth_ros.bags import open_recording
 
 SMALL = ("--untrained", "--height", "64", "--width", "96")
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
@@ -89,6 +90,16 @@ def two_sets(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The depth of the sample's first two sets."""
     folder = tmp_path_factory.mktemp("two_sets")
     return run(recordings.write_rosbag2(folder / "recording", recordings.sample_entries(2)), folder / "depth")
+
+
+def test_the_same_recording_twice_gives_the_same_messages_to_the_bit(two_sets: Path, tmp_path: Path):
+    again = run(recordings.write_rosbag2(tmp_path / "recording", recordings.sample_entries(2)), tmp_path / "depth")
+    found = []
+    for path in (two_sets, again):
+        with open_recording(path) as recording:
+            found.append([(m.topic, m.log_time, bytes(m.cdr)) for m in recording.messages()])
+    assert len(found[0]) > 2 * len(CAMERAS)
+    assert found[0] == found[1]
 
 
 def test_every_set_of_the_sample_is_written(whole: Path, messages: Messages):
