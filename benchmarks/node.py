@@ -39,6 +39,7 @@ def main() -> None:
                 "benchmark": "node",
                 "case": case,
                 **sizes,
+                "rounds": found["sets_received"],
                 **{name: found[name] for name in _SHARED},
                 "age_p50_ms": found["age_ms"]["p50"],
                 "age_p95_ms": found["age_ms"]["p95"],

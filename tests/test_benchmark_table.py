@@ -24,8 +24,8 @@ def benchmarks(monkeypatch: pytest.MonkeyPatch):
     import table
 
     yield measuring, table
-    for name in ("measuring", "table"):
-        sys.modules.pop(name)
+    for name in ("measuring", "table", "node"):
+        sys.modules.pop(name, None)
 
 
 def test_every_benchmark_has_its_place_on_the_page():
@@ -63,3 +63,18 @@ def test_cases_take_turns_and_the_first_round_is_not_counted(benchmarks):
     timings = benchmarks[0].measure_in_turns({"a": lambda: order.append("a"), "b": lambda: order.append("b")}, 2)
     assert "".join(order) == "ababab"
     assert {name: (len(found.wall), len(found.cpu)) for name, found in timings.items()} == {"a": (2, 2), "b": (2, 2)}
+
+
+def test_the_lines_of_the_nodes_benchmark_have_all_that_the_table_needs(
+    benchmarks, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    import node
+
+    found = dict.fromkeys(("median_ms", "p95_ms", "per_second", "outside_inference", "peak_memory_mb"), 2.0)
+    found |= {"sets_received": 7, "age_ms": {"p50": 1.0, "p95": 2.0}, "stages_ms": {"inference": {"p50_ms": 1.5}}}
+    monkeypatch.setattr(node, "measured", lambda _: found | {"baseline": found | {"median_ms": 8.0}})
+    monkeypatch.setattr(sys, "argv", ["node.py"])
+    node.main()
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [(line["case"], line["times_baseline"]) for line in lines] == [("straightforward", 1.0), ("node", 4.0)]
+    assert "medians of 7 rounds" in benchmarks[1].markdown(lines)
