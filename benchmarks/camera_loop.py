@@ -2,7 +2,8 @@
 """The training step as one writes it at first: samples, cameras, frames and neighbours one after the other.
 
 The baseline of training_step.py. Networks, terms and their weights are the trainer's; what differs is that every view
-is computed on its own. Without batch statistics the loss is that of `evaluate_objective`.
+is computed on its own. Without batch statistics the loss is that of `evaluate_objective`; the term of the pose
+consistency, a few numbers a camera, is left out.
 """
 
 from __future__ import annotations
