@@ -15,8 +15,19 @@ from cvcdepth_ros.bags.topics import LATCHED, RecordedMessage, RecordingFile, To
 from cvcdepth_ros.bags.typestores import parsed_definition, typestore, typestore_for
 
 MAGIC = b"#ROSBAG V2.0\n"
-# What rosbags and the decompressors raise on damaged bytes (its reader also asserts; bz2: EOFError, lz4: RuntimeError).
-_DAMAGE = (ReaderError, SerdeError, AssertionError, struct.error, ValueError, EOFError, RuntimeError, OSError)
+# What rosbags and the decompressors raise on damaged bytes. Its reader also asserts, and looks up connections that the
+# file does not have; bz2: EOFError, lz4: RuntimeError.
+_DAMAGE = (
+    ReaderError,
+    SerdeError,
+    AssertionError,
+    LookupError,
+    struct.error,
+    ValueError,
+    EOFError,
+    RuntimeError,
+    OSError,
+)
 # The types that ROS 1 lays out differently (the header has a sequence number there) or has built in.
 _ROS2_TYPES = ("std_msgs/msg/Header", "builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 

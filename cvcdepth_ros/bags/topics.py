@@ -88,8 +88,8 @@ class RecordingFile(ABC):
 
 
 def error_text(error: BaseException) -> str:
-    """Return the error's message; damaged bytes also raise errors that have none."""
-    return str(error) or type(error).__name__
+    """Return the error's message; damaged bytes also raise errors that have none, or nothing but a missing key."""
+    return f"{type(error).__name__} {error}".strip() if isinstance(error, LookupError) or not str(error) else str(error)
 
 
 def joined_topics(topics: Collection[Topic], where: Location) -> dict[str, Topic]:
