@@ -15,7 +15,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import count, islice
+from itertools import cycle, islice
 from pathlib import Path
 
 import cv2
@@ -50,8 +50,7 @@ class Drive:
 
     def there_and_back(self) -> Iterator[SurroundDepth]:
         """Give the sets forwards and backwards, for ever."""
-        order = [*range(len(self.sets)), *range(len(self.sets) - 2, 0, -1)]
-        return (self.sets[order[number % len(order)]] for number in count())
+        return cycle([*self.sets, *self.sets[-2:0:-1]])
 
     def _changed_set(self, surround: SurroundDepth, camera: int, change: Change) -> SurroundDepth:
         depth, pictures = surround.depth.copy(), surround.pictures.copy()
