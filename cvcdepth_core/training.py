@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The training loop: plain torch, one process or several, a run folder that survives being killed at any moment.
+"""The training loop: plain torch, one process or several, to be killed and resumed at any moment.
 
 Every sample's random draws come from a generator seeded by the configuration's seed, the step's number and the sample's
 place in the step, and the batches of an epoch from seed and epoch. So a resumed run computes exactly what an
@@ -22,24 +22,19 @@ from typing import Any, Protocol, cast
 
 import numpy as np
 import torch
-import yaml
-from pydantic import ValidationError
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 from tqdm import tqdm
 
-from cvcdepth_core.atomic_file import write_atomically
 from cvcdepth_core.augmentation import draw_flips, jitter_colors
-from cvcdepth_core.checkpoint import Checkpoint, load_network_state, save_checkpoint
+from cvcdepth_core.checkpoint import save_checkpoint
 from cvcdepth_core.distributed import ALONE, Processes, share_batch_statistics
-from cvcdepth_core.errors import CheckpointError, ConfigError, OutputError, TrainingError
-from cvcdepth_core.networks import DepthNet, PoseNet
+from cvcdepth_core.errors import ConfigError, TrainingError
 from cvcdepth_core.objective import ObjectiveValue, Prediction, evaluate_objective
 from cvcdepth_core.rig_batch import RigBatch
+from cvcdepth_core.run_folder import RunFolder, RunIdentity
 from cvcdepth_core.surround_model import SurroundModel
 from cvcdepth_core.training_config import AugmentationConfig, TrainingConfig
-
-CHECKPOINT_FILE, STATE_FILE, LOG_FILE, CONFIG_FILE = "last.safetensors", "state.pt", "log.jsonl", "config.yaml"
 
 _MAX_SKIPPED_IN_A_ROW = 20
 
@@ -104,47 +99,6 @@ class Progress:
     """Whether a validation has ended the run."""
 
 
-def build_surround_model(config: TrainingConfig, start: Checkpoint | None = None) -> SurroundModel:
-    """Return both networks of `config` with random weights by its seed, or with those of `start`.
-
-    A checkpoint without a pose network leaves that random. Raises CheckpointError, naming the values, when `start` was
-    built for another encoder or depth range: its disparities would mean other depths.
-    """
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(config.seed)
-        depth_net, pose_net = DepthNet(config.depth.encoder), PoseNet(config.pose.encoder)
-    if start is not None:
-        _refuse_other_meaning(start, config)
-        load_network_state(depth_net, start.depth_net, origin=f"{start.path}: depth network")
-        if start.pose_net:
-            load_network_state(pose_net, start.pose_net, origin=f"{start.path}: pose network")
-    return SurroundModel(
-        depth_net,
-        pose_net,
-        min_depth=config.depth.min_depth,
-        max_depth=config.depth.max_depth,
-        focal_scale=config.depth.focal_scale,
-        pose_method=config.pose.method,
-    )
-
-
-def _refuse_other_meaning(start: Checkpoint, config: TrainingConfig) -> None:
-    # Depth goes with fx / focal_scale, and fx with the width: at another width, focal_scale has to follow.
-    same_meaning = start.spec.focal_scale * config.depth.width / start.spec.width
-    for name, found in (
-        ("encoder", start.spec.encoder),
-        ("min_depth", start.spec.min_depth),
-        ("max_depth", start.spec.max_depth),
-        ("focal_scale", same_meaning),
-    ):
-        want = getattr(config.depth, name)
-        if found != want:
-            at = f" at a width of {config.depth.width}" if name == "focal_scale" else ""
-            raise CheckpointError(
-                f"{start.path}: {name} is {found}{at}, but the configuration's depth.{name} is {want}"
-            )
-
-
 class Trainer:
     """Trains a model on batches into a run folder, from where the folder's last checkpoint stands."""
 
@@ -178,7 +132,7 @@ class Trainer:
         self._validate = validate
         self._observers = tuple(observers) if processes.is_first else ()
         self._metadata = dict(metadata or {})
-        self._run = run_directory
+        self._folder = RunFolder(run_directory)
         self._optimizer = torch.optim.AdamW(
             self.model.parameters(),
             lr=config.optimizer.learning_rate,
@@ -191,7 +145,7 @@ class Trainer:
         if config.optimizer.compile:
             _compile(self.model)
         if processes.is_first:
-            self._run.mkdir(parents=True, exist_ok=True)
+            self._folder.create()
         self._resume()
 
     @property
@@ -205,8 +159,7 @@ class Trainer:
         Raises TrainingError when the loss stays non-finite.
         """
         if self._processes.is_first:
-            text = yaml.safe_dump(self.config.model_dump(mode="json"), sort_keys=False)
-            write_atomically(self._run / CONFIG_FILE, text.encode())
+            self._folder.write_config(self.config)
         epochs = self.config.optimizer.epochs
         if self.progress.step == 0 and not self.validations:
             self._score()
@@ -223,20 +176,17 @@ class Trainer:
         """Write what resuming needs, then the checkpoint; each appears complete or not at all."""
         if not self._processes.is_first:
             return
-        state = {
-            "config": self.config.model_dump_json(),
-            "samples": self._batches.samples,
-            "samples_together": self._samples_together,
-            "progress": asdict(self.progress),
-            "validations": json.dumps(self.validations),
-            "model": self.model.state_dict(),
-            "average": None if self._average is None else self._average.state_dict(),
-            "optimizer": self._optimizer.state_dict(),
-        }
-        content = io.BytesIO()
-        torch.save(state, content)
-        write_atomically(self._run / STATE_FILE, content.getvalue())
-        self.save_result(self._run / CHECKPOINT_FILE)
+        self._folder.write_state(
+            {
+                **self._identity.to_state(),
+                "progress": asdict(self.progress),
+                "validations": json.dumps(self.validations),
+                "model": self.model.state_dict(),
+                "average": None if self._average is None else self._average.state_dict(),
+                "optimizer": self._optimizer.state_dict(),
+            }
+        )
+        self.save_result(self._folder.checkpoint)
 
     def save_result(self, path: Path) -> None:
         """Write `result` as a checkpoint."""
@@ -247,6 +197,10 @@ class Trainer:
             self.result.pose_net.state_dict(),
             {**self._metadata, "step": str(self.progress.step), "epoch": str(self.progress.epoch)},
         )
+
+    @property
+    def _identity(self) -> RunIdentity:
+        return RunIdentity(self.config, self._batches.samples, self._samples_together)
 
     @property
     def _samples_together(self) -> int:
@@ -260,11 +214,10 @@ class Trainer:
         return self.progress.epoch * samples + min(self.progress.batch * self._samples_together, samples)
 
     def _resume(self) -> None:
-        path = self._run / STATE_FILE
-        content = self._processes.told_by_first(_content(path) if self._processes.is_first else b"")
+        content = self._processes.told_by_first(self._folder.read_state() if self._processes.is_first else b"")
         if content:
             state = torch.load(io.BytesIO(content), map_location=self._device, weights_only=True)
-            self._refuse_other_run(path, state)
+            self._identity.refuse_other(state, self._folder.state)
             self.progress = Progress(**state["progress"])
             self.validations = json.loads(state["validations"])
             self.model.load_state_dict(state["model"])
@@ -272,45 +225,7 @@ class Trainer:
             if self._average is not None:
                 self._average.load_state_dict(state["average"])
         if self._processes.is_first:
-            self._drop_log_of_lost_steps()
-            for unfinished in self._run.glob(".*.tmp"):
-                unfinished.unlink()  # of a process that was killed while it wrote
-
-    def _drop_log_of_lost_steps(self) -> None:
-        """Drop what a killed run had logged after its last checkpoint: it will be made again."""
-        path = self._run / LOG_FILE
-        if not path.exists():
-            return
-        kept, validated = [], {(entry["step"], entry["epoch"]) for entry in self.validations}
-        for line in path.read_text(encoding="utf-8").splitlines():
-            try:
-                entry = json.loads(line)
-            except ValueError:
-                break  # cut while it was written
-            place = (entry["step"], entry["epoch"])
-            if place in validated if "validation" in entry else entry["step"] <= self.progress.step:
-                kept.append(line + "\n")
-        write_atomically(path, "".join(kept).encode())
-
-    def _refuse_other_run(self, path: Path, state: Mapping[str, Any]) -> None:
-        """Raise unless the run that `state` is of would have computed the same; it may have been shorter."""
-        was, now = (_what_is_computed(config) for config in (_configuration(path, state), self.config))
-        changed = [name for name in now if was[name] != now[name]]
-        if changed:
-            raise CheckpointError(
-                f"{path}: was made with another configuration ({', '.join(changed)}); resume with the run's own "
-                f"{CONFIG_FILE}, or choose another folder"
-            )
-        if state["samples_together"] != self._samples_together:
-            raise CheckpointError(
-                f"{path}: {state['samples_together']} samples went through the networks together, now it is "
-                f"{self._samples_together} (optimizer.samples_per_batch x {self._processes.count} processes)"
-            )
-        if state["samples"] != self._batches.samples:
-            raise CheckpointError(
-                f"{path}: was made from {state['samples']} samples, now there are {self._batches.samples}; "
-                "choose another folder"
-            )
+            self._folder.drop_remains(self.progress.step, self.validations)
 
     def _train_epoch(self, bar: tqdm[Any]) -> None:
         optimizer = self.config.optimizer
@@ -417,7 +332,7 @@ class Trainer:
         if self._skipped_in_a_row >= _MAX_SKIPPED_IN_A_ROW:
             raise TrainingError(
                 f"step {self.progress.step}: loss or gradient is not finite, or no sample could be read, for "
-                f"{_MAX_SKIPPED_IN_A_ROW} steps in a row; {self._run / CHECKPOINT_FILE} is the last good checkpoint"
+                f"{_MAX_SKIPPED_IN_A_ROW} steps in a row; {self._folder.checkpoint} is the last good checkpoint"
             )
 
     def _score(self) -> None:
@@ -442,14 +357,8 @@ class Trainer:
         return json.dumps({**place, "validation": dict(outcome.scores), "stop": outcome.stop}).encode()
 
     def _log(self, entry: Mapping[str, Any]) -> None:
-        if not self._processes.is_first:
-            return
-        path = self._run / LOG_FILE
-        try:
-            with path.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(entry) + "\n")
-        except OSError as error:
-            raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
+        if self._processes.is_first:
+            self._folder.append_to_log(entry)
 
 
 def _prepared(model: SurroundModel, device: torch.device, processes: Processes) -> SurroundModel:
@@ -486,30 +395,6 @@ def _compile(model: SurroundModel) -> None:
         )
     model.depth_net.compile()
     model.pose_net.compile()
-
-
-def _content(path: Path) -> bytes:
-    return path.read_bytes() if path.exists() else b""
-
-
-def _configuration(path: Path, state: Mapping[str, Any]) -> TrainingConfig:
-    """Return the configuration of the run that `state` is of; fields that are newer than it have their defaults."""
-    try:
-        return TrainingConfig.model_validate_json(state["config"])
-    except ValidationError as error:
-        raise CheckpointError(f"{path}: its configuration is not one of this version: {error}") from error
-
-
-def _what_is_computed(config: TrainingConfig) -> dict[str, Any]:
-    """Return the fields that decide the weights after a step, not how many there are or what is told of them."""
-    return config.model_dump(
-        exclude={
-            "optimizer": {"epochs", "samples_per_batch"},
-            "recordings": {"workers", "cache_mb"},
-            "checkpoint_every": True,
-            "pictures_every": True,
-        }
-    )
 
 
 def _generator(seed: int, step: int, place: int) -> torch.Generator:

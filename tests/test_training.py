@@ -19,7 +19,8 @@ from scenes import random_batch
 from cvcdepth_core.checkpoint import DepthModelSpec, load_checkpoint, save_checkpoint
 from cvcdepth_core.errors import CheckpointError, ConfigError, OutputError, TrainingError
 from cvcdepth_core.networks import DepthNet
-from cvcdepth_core.training import Trainer, ValidationOutcome, build_surround_model
+from cvcdepth_core.starting_model import build_surround_model
+from cvcdepth_core.training import Trainer, ValidationOutcome
 from cvcdepth_core.training_config import OptimizerConfig, PoseConfig, TrainingConfig
 
 SPEC = DepthModelSpec(encoder="efficientnet_lite0", height=64, width=64, min_depth=0.5, max_depth=80)

@@ -24,7 +24,9 @@ import torch
 
 from cvcdepth_core.checkpoint import load_checkpoint
 from cvcdepth_core.rig import load_rig_layout
-from cvcdepth_core.training import CHECKPOINT_FILE, Trainer, build_surround_model
+from cvcdepth_core.run_folder import CHECKPOINT_FILE
+from cvcdepth_core.starting_model import build_surround_model
+from cvcdepth_core.training import Trainer
 from cvcdepth_core.training_config import TrainingConfig, load_training_config
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.settings import MatchingSettings

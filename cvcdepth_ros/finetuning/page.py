@@ -14,7 +14,7 @@ import jinja2
 
 from cvcdepth_core.atomic_file import write_atomically
 from cvcdepth_core.errors import CvcDepthError
-from cvcdepth_core.training import LOG_FILE
+from cvcdepth_core.run_folder import LOG_FILE
 from cvcdepth_ros.evaluation.frames import SetScore
 from cvcdepth_ros.evaluation.job import EvaluationJob
 from cvcdepth_ros.evaluation.report.page import chosen_sets, drawn_again, to_data_url, to_number

@@ -14,8 +14,10 @@ from cvcdepth_core.checkpoint import Checkpoint, load_checkpoint, save_checkpoin
 from cvcdepth_core.distributed import Processes, own_device
 from cvcdepth_core.engines import resolve_device
 from cvcdepth_core.errors import CheckpointError
+from cvcdepth_core.run_folder import CHECKPOINT_FILE
+from cvcdepth_core.starting_model import build_surround_model
 from cvcdepth_core.surround_model import SurroundModel
-from cvcdepth_core.training import CHECKPOINT_FILE, RunObserver, Trainer, build_surround_model
+from cvcdepth_core.training import RunObserver, Trainer
 from cvcdepth_core.training_config import TrainingConfig
 from cvcdepth_ros.evaluation.result import EvaluationResult
 from cvcdepth_ros.finetuning.held_out import HeldOutPart, evaluate, held_out_parts, some_sets
