@@ -19,13 +19,14 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from cvcdepth_core.errors import ConfigError
+from cvcdepth_core.errors import ConfigError, TransformError
 from cvcdepth_core.rig import RigLayout
 from cvcdepth_ros.camera_discovery import COMPRESSED_IMAGE_TYPE, IMAGE_TYPE
 from cvcdepth_ros.camera_states import CameraState, Trouble
+from cvcdepth_ros.qos import input_qos, refusing_impossible_qos
+from cvcdepth_ros.transforms import TransformTree
 
 _IMAGE_CLASSES = {IMAGE_TYPE: Image, COMPRESSED_IMAGE_TYPE: CompressedImage}
-_INPUT_DEPTH = 10
 
 
 def topic_types(node: Node) -> dict[str, list[str]]:
@@ -44,7 +45,10 @@ class CameraInputs:
         on_image: Callable[[str, Any], None],
         on_camera_info: Callable[[str, Any], None],
     ) -> None:
-        """Both callbacks get the camera's name first; they run on the executor's thread and must be short."""
+        """Both callbacks get the camera's name first; they run on the executor's thread and must be short.
+
+        ConfigError names a camera_info topic that cannot be subscribed.
+        """
         self._node = node
         self._reliable = reliable
         self._on_image = on_image
@@ -52,9 +56,14 @@ class CameraInputs:
         self._subscriptions: dict[str, Subscription] = {}
         self._cameras: dict[str, str] = {}
         self._connected: set[str] = set()
+        self._refused: dict[str, str] = {}
         self.lost: dict[str, int] = dict.fromkeys(self._image_topics, 0)
-        for camera in layout.cameras:
-            self._subscribe(camera.name, CameraInfo, camera.camera_info_topic, partial(on_camera_info, camera.name))
+        try:
+            for camera in layout.cameras:
+                self._subscribe(camera.name, CameraInfo, camera.camera_info_topic, partial(on_camera_info, camera.name))
+        except ConfigError:
+            self.close()
+            raise
 
     def connect(self) -> None:
         """Subscribe the image topics that have appeared since the last call."""
@@ -63,7 +72,10 @@ class CameraInputs:
             known = [_IMAGE_CLASSES[name] for name in types.get(topic, ()) if name in _IMAGE_CLASSES]
             if camera not in self._connected and known:
                 self._connected.add(camera)
-                self._subscribe(camera, known[0], topic, partial(self._on_image, camera))
+                try:
+                    self._subscribe(camera, known[0], topic, partial(self._on_image, camera))
+                except ConfigError as error:
+                    self._refused[camera] = str(error)
 
     def troubles(self) -> dict[str, list[Trouble]]:
         """Say for each camera why no image can arrive."""
@@ -87,6 +99,8 @@ class CameraInputs:
     def _image_troubles(self, camera: str, topic: str, types: list[str]) -> list[Trouble]:
         if not self._node.count_publishers(topic):
             return [(CameraState.WAITING_FOR_IMAGES, f"no publisher on {topic}")]
+        if camera in self._refused:
+            return [(CameraState.REJECTED, self._refused[camera])]
         if camera not in self._connected:
             unusable = f"{topic} carries {', '.join(types)}, want {' or '.join(_IMAGE_CLASSES)}"
             return [(CameraState.REJECTED, unusable)]
@@ -105,22 +119,24 @@ class CameraInputs:
         def message_lost(event: Any) -> None:
             self.lost[camera] += event.total_count_change
 
+        with refusing_impossible_qos(topic):
+            self._subscriptions[topic] = self._node.create_subscription(
+                message_class,
+                topic,
+                callback,
+                # Overrides are written into the profile that is handed over: each subscription needs its own.
+                input_qos(self._reliable),
+                event_callbacks=SubscriptionEventCallbacks(message_lost=message_lost),
+                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            )
         self._cameras[topic] = camera
-        self._subscriptions[topic] = self._node.create_subscription(
-            message_class,
-            topic,
-            callback,
-            # Overrides are written into the profile that is handed over: each subscription needs its own.
-            input_qos(self._reliable),
-            event_callbacks=SubscriptionEventCallbacks(message_lost=message_lost),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-        )
 
 
 class StaticTransformInput:
     """Subscribes `/tf_static`. Where tf2_msgs is not installed (the wheels lack it), building it is a ConfigError."""
 
-    def __init__(self, node: Node, on_transforms: Callable[[Any], None]) -> None:
+    def __init__(self, node: Node, tree: TransformTree, on_change: Callable[[], None] = lambda: None) -> None:
+        """Add to `tree` all that fits into it, tell the rest in the log, and call `on_change` after each message."""
         try:
             from tf2_msgs.msg import TFMessage
         except ImportError as error:
@@ -128,25 +144,22 @@ class StaticTransformInput:
                 "the rig file leaves base_T_camera to /tf_static, but tf2_msgs is not installed here; "
                 "write a complete rig file with: bag_replay rig BAG -o rig.yaml"
             ) from error
-        self._node = node
+        self._node, self._tree, self._on_change = node, tree, on_change
         qos = QoSProfile(
             history=HistoryPolicy.KEEP_LAST,
             depth=100,
             reliability=ReliabilityPolicy.RELIABLE,
             durability=DurabilityPolicy.TRANSIENT_LOCAL,
         )
-        self._subscription = node.create_subscription(TFMessage, "/tf_static", on_transforms, qos)
+        self._subscription = node.create_subscription(TFMessage, "/tf_static", self._on_message, qos)
 
     def close(self) -> None:
         """Drop the subscription."""
         self._node.destroy_subscription(self._subscription)
 
-
-def input_qos(reliable: bool) -> QoSProfile:
-    """Sensor-data QoS with room for one second of a 10 Hz camera, or the same reliably."""
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=_INPUT_DEPTH,
-        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.VOLATILE,
-    )
+    def _on_message(self, message: Any) -> None:
+        try:
+            self._tree.add_message(message)
+        except TransformError as error:
+            self._node.get_logger().error(f"/tf_static: {error}", throttle_duration_sec=5.0)
+        self._on_change()

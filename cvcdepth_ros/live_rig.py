@@ -3,18 +3,18 @@
 
 import time
 from functools import partial
-from typing import Any
 
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo
 
-from cvcdepth_core.errors import TransformError
+from cvcdepth_core.errors import CvcDepthError
 from cvcdepth_core.rig import CameraEntry, RigLayout
 from cvcdepth_ros.camera_discovery import discover_cameras
 from cvcdepth_ros.inputs import StaticTransformInput, topic_types
 from cvcdepth_ros.rig_assembly import RigAssembler
+from cvcdepth_ros.transforms import TransformTree
 
 _SETTLING_SECONDS = 3.0
 
@@ -29,8 +29,9 @@ class LiveRigDiscovery:
         self._entries: tuple[CameraEntry, ...] = ()
         self._assembler: RigAssembler | None = None
         self._subscriptions: list[Subscription] = []
-        self._static_transforms: list[Any] = []
-        self._transforms = StaticTransformInput(node, self._on_transforms)
+        self._tree = TransformTree()
+        self._refusal = ""
+        self._transforms = StaticTransformInput(node, self._tree)
         self._changed = time.monotonic()
 
     def poll(self) -> RigLayout | None:
@@ -39,7 +40,11 @@ class LiveRigDiscovery:
         settled = time.monotonic() - self._changed > _SETTLING_SECONDS
         if not settled or self._assembler is None or self._assembler.problems():
             return None
-        return self._assembler.completed_layout()
+        try:
+            return self._assembler.completed_layout()
+        except CvcDepthError as error:  # cameras that are each complete but together no rig
+            self._refusal = str(error)
+            return None
 
     def problem(self) -> str:
         """Say what is still missing."""
@@ -47,7 +52,7 @@ class LiveRigDiscovery:
             names = ", ".join(entry.name for entry in self._entries) or "none"
             return f"rig auto: waiting for at least two cameras with image and camera_info topics, found {names}"
         problems = self._assembler.problems() if self._assembler else {}
-        return "rig auto: " + next(iter(problems.values()), "waiting for the set of cameras to settle")
+        return "rig auto: " + next(iter(problems.values()), self._refusal or "waiting for the set of cameras to settle")
 
     def close(self) -> None:
         """Drop all subscriptions."""
@@ -65,9 +70,7 @@ class LiveRigDiscovery:
         self._drop_camera_infos()
         self._assembler = None
         if len(entries) >= 2:
-            self._assembler = RigAssembler(RigLayout(base_frame=self._base_frame, cameras=entries))
-            for message in self._static_transforms:
-                self._assembler.transforms.add_message(message)
+            self._assembler = RigAssembler(RigLayout(base_frame=self._base_frame, cameras=entries), self._tree)
             self._subscriptions = [self._subscribe(entry, self._assembler) for entry in entries]
 
     def _subscribe(self, entry: CameraEntry, assembler: RigAssembler) -> Subscription:
@@ -75,14 +78,6 @@ class LiveRigDiscovery:
         return self._node.create_subscription(
             CameraInfo, entry.camera_info_topic, lambda message: callback(message), qos_profile_sensor_data
         )
-
-    def _on_transforms(self, message: Any) -> None:
-        self._static_transforms.append(message)
-        if self._assembler is not None:
-            try:
-                self._assembler.transforms.add_message(message)
-            except TransformError as error:
-                self._node.get_logger().error(f"/tf_static: {error}")
 
     def _drop_camera_infos(self) -> None:
         for subscription in self._subscriptions:

@@ -9,11 +9,13 @@ from rclpy.publisher import Publisher
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
+from cvcdepth_core.errors import ConfigError
 from cvcdepth_core.estimator import SurroundDepth
 from cvcdepth_core.pointcloud import CloudLimits
 from cvcdepth_core.rig import Rig
 from cvcdepth_ros.latencies import StageLatencies
 from cvcdepth_ros.messages import ros_message_class, ros_message_factory
+from cvcdepth_ros.qos import refusing_impossible_qos
 from cvcdepth_ros.surround_messages import SurroundMessages, camera_topics, output_types
 from cvcdepth_ros.synchronizer import SurroundSet
 
@@ -22,10 +24,17 @@ class SurroundOutputs:
     """Publishes one set's depth, pictures and clouds under the node's private names."""
 
     def __init__(self, node: Node, cameras: list[str], depth_encoding: str, latencies: StageLatencies) -> None:
+        """Advertise; ConfigError names a topic that cannot be."""
         self._node = node
         self._latencies = latencies
         self._messages = SurroundMessages(ros_message_factory(), depth_encoding)
-        self._publishers = {topic: self._publisher(topic, type_) for topic, type_ in output_types(cameras).items()}
+        self._publishers: dict[str, Publisher] = {}
+        try:
+            for topic, type_name in output_types(cameras).items():
+                self._publishers[topic] = self._publisher(topic, type_name)
+        except ConfigError:
+            self.close()
+            raise
 
     def wanted(self, camera: str) -> bool:
         """Whether anybody subscribes something for which this camera's depth is needed."""
@@ -55,10 +64,11 @@ class SurroundOutputs:
         return bool(self._publishers[topic].get_subscription_count())
 
     def _publisher(self, topic: str, type_name: str) -> Publisher:
-        return self._node.create_publisher(
-            ros_message_class(type_name),
-            f"~/{topic}",
-            # Overrides are written into the profile that is handed over: each publisher needs its own.
-            QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10, reliability=ReliabilityPolicy.RELIABLE),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-        )
+        with refusing_impossible_qos(topic):
+            return self._node.create_publisher(
+                ros_message_class(type_name),
+                f"~/{topic}",
+                # Overrides are written into the profile that is handed over: each publisher needs its own.
+                QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10, reliability=ReliabilityPolicy.RELIABLE),
+                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            )

@@ -2,6 +2,7 @@
 """What a process that moves large images over DDS must set up before anything else. Call it first in `main`."""
 
 import ctypes
+import gc
 import os
 
 from cvcdepth_ros.share import share_directory
@@ -23,6 +24,18 @@ def prepare_process() -> None:
     profile = str(share_directory() / "config" / "fastdds_large_shm.xml")
     if not any(variable in os.environ for variable in _PROFILE_VARIABLES):
         os.environ.update(dict.fromkeys(_PROFILE_VARIABLES, profile))
+
+
+def return_memory() -> None:
+    """Give what is not used any more back to the system, after something large was dropped.
+
+    Python sees no reason to hurry, for it does not know how much memory a network has outside of it; and glibc was
+    told to keep it (`prepare_process`).
+    """
+    gc.collect()
+    malloc_trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if malloc_trim is not None:
+        malloc_trim(0)
 
 
 def _keep_large_buffers() -> None:

@@ -12,14 +12,12 @@ from cvcdepth_ros.transforms import TransformTree
 
 
 class RigAssembler:
-    """Collects calibrations and transforms until a layout's cameras are complete.
+    """Collects calibrations until a layout's cameras are complete."""
 
-    `transforms` is the tree of static transforms; whoever receives them adds them there.
-    """
-
-    def __init__(self, layout: RigLayout) -> None:
+    def __init__(self, layout: RigLayout, transforms: TransformTree | None = None) -> None:
+        """Use `transforms`, the tree to which whoever receives static transforms adds them."""
         self.layout = layout
-        self.transforms = TransformTree()
+        self.transforms = TransformTree() if transforms is None else transforms
         self.frames_on_tf: list[str] = []
         """Sensor frames whose fixed poses a recording told on `/tf`, not `/tf_static`."""
         self._calibrations: dict[str, Calibration] = {}

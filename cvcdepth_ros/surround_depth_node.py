@@ -12,7 +12,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
-from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.utilities import remove_ros_args
 
@@ -22,6 +22,7 @@ from cvcdepth_core.rig import RigLayout, load_rig_layout
 from cvcdepth_ros.camera_states import CameraCondition, CameraState
 from cvcdepth_ros.diagnostics import ERROR, OK, WARN, status
 from cvcdepth_ros.live_rig import LiveRigDiscovery
+from cvcdepth_ros.managed_node import ManagedNode
 from cvcdepth_ros.node_parameters import (
     AUTO,
     CHANGEABLE_WHILE_RUNNING,
@@ -29,7 +30,7 @@ from cvcdepth_ros.node_parameters import (
     declare_parameters,
     read_parameters,
 )
-from cvcdepth_ros.process_setup import prepare_process
+from cvcdepth_ros.process_setup import prepare_process, return_memory
 from cvcdepth_ros.surround_session import SurroundSession
 
 _POLL_SECONDS = 0.25
@@ -44,7 +45,7 @@ parameters (all are described by `ros2 param describe /surround_depth NAME`):
 """
 
 
-class SurroundDepthNode(LifecycleNode):  # type: ignore[misc] # rclpy is not annotated
+class SurroundDepthNode(ManagedNode):
     """Configure loads rig and network, activate subscribes and publishes; problems go to the log and /diagnostics."""
 
     def __init__(self) -> None:
@@ -56,7 +57,6 @@ class SurroundDepthNode(LifecycleNode):  # type: ignore[misc] # rclpy is not ann
         self._layout: RigLayout | None = None
         self._discovery: LiveRigDiscovery | None = None
         self._session: SurroundSession | None = None
-        self._failure = ""
         self._reported: dict[str, CameraCondition] = {}
         self._refused = 0
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
@@ -72,47 +72,28 @@ class SurroundDepthNode(LifecycleNode):  # type: ignore[misc] # rclpy is not ann
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Read the parameters, the rig file and the checkpoint; FAILURE with the reason in the log."""
-        try:
-            parameters = read_parameters(self)
-            parameters.check_complete()
-            if parameters.rig != AUTO:
-                self._layout = load_rig_layout(Path(parameters.rig).expanduser())
-            self._estimator = parameters.build_estimator()
-        except CvcDepthError as error:
-            return self._fail(str(error))
-        self._settings, self._failure = parameters, ""
-        self.get_logger().info(f"model: {self._estimator.model_id} on {self._estimator.device}")
-        if parameters.notice:
-            self.get_logger().warning(parameters.notice)
-        return TransitionCallbackReturn.SUCCESS
+        return self.attempt(self._configure)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Subscribe and publish; with rig 'auto' as soon as the cameras are found."""
-        if self._settings is None:
-            return TransitionCallbackReturn.FAILURE
-        try:
-            if self._layout is None:
-                self._discovery = LiveRigDiscovery(self, self._settings.base_frame)
-            else:
-                self._start_session(self._layout)
-        except CvcDepthError as error:
-            return self._fail(str(error))
-        return super().on_activate(state)
+        return self.attempt(self._activate)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop subscribing and publishing."""
-        self.stop()
-        return super().on_deactivate(state)
+        return self.attempt(self._deactivate)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Forget rig and network."""
-        self.stop()
-        self._settings = self._estimator = self._layout = None
-        return TransitionCallbackReturn.SUCCESS
+        return self.attempt(self._release)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """End for good."""
-        return self.on_cleanup(state)
+        return self.attempt(self._release)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Give up what a failed transition has left, and be unconfigured; `failure` keeps the reason."""
+        self._release()
+        return TransitionCallbackReturn.SUCCESS
 
     def stop(self) -> bool:
         """End the active period; False when the worker is still inside its last inference."""
@@ -129,10 +110,35 @@ class SurroundDepthNode(LifecycleNode):  # type: ignore[misc] # rclpy is not ann
             )
         return session.close()
 
-    def _fail(self, reason: str) -> TransitionCallbackReturn:
-        self._failure = reason
-        self.get_logger().error(reason)
-        return TransitionCallbackReturn.FAILURE
+    def _configure(self) -> None:
+        parameters = read_parameters(self)
+        parameters.check_complete()
+        layout = None if parameters.rig == AUTO else load_rig_layout(Path(parameters.rig).expanduser())
+        self._estimator = self._built_estimator(parameters)
+        self._settings, self._layout = parameters, layout
+
+    def _activate(self) -> None:
+        if self._layout is None:
+            self._discovery = LiveRigDiscovery(self, read_parameters(self).base_frame)
+        else:
+            self._start_session(self._layout)
+
+    def _deactivate(self) -> None:
+        self.stop()
+        return_memory()
+
+    def _release(self) -> None:
+        self.stop()
+        self._settings = self._estimator = self._layout = None
+        return_memory()
+
+    def _built_estimator(self, parameters: NodeParameters) -> DepthEstimator:
+        self.get_logger().info(f"building the network for {parameters.device} with backend {parameters.backend}")
+        estimator = self.wait_for(parameters.build_estimator)
+        self.get_logger().info(f"model: {estimator.model_id} on {estimator.device}")
+        if parameters.notice:
+            self.get_logger().warning(parameters.notice)
+        return estimator
 
     def _start_session(self, layout: RigLayout) -> None:
         if self._settings is not None and self._estimator is not None:
@@ -181,13 +187,14 @@ class SurroundDepthNode(LifecycleNode):  # type: ignore[misc] # rclpy is not ann
         self._diagnostics.publish(message)
 
     def _node_status(self) -> DiagnosticStatus:
-        if self._failure:
-            return status(ERROR, "node", self._failure)
-        if self._discovery is not None:
-            return status(WARN, "node", self._discovery.problem())
-        if self._session is None:
-            return status(OK, "node", "inactive" if self._settings else "unconfigured")
-        return status(OK, "node", "active")
+        level, message = OK, "active"
+        if self.failure:
+            level, message = ERROR, self.failure
+        elif self._discovery is not None:
+            level, message = WARN, self._discovery.problem()
+        elif self._session is None:
+            message = "inactive" if self._settings else "unconfigured"
+        return status(level, "node", message, {"unforeseen errors": self.errors})
 
     def _on_set_parameters(self, changed: Sequence[Parameter]) -> SetParametersResult:
         fixed = [
@@ -201,16 +208,18 @@ class SurroundDepthNode(LifecycleNode):  # type: ignore[misc] # rclpy is not ann
                 self._replace_model(parameters)
         except CvcDepthError as error:
             return SetParametersResult(successful=False, reason=str(error))
+        except Exception as error:
+            return SetParametersResult(successful=False, reason=self.report(error))
         return SetParametersResult(successful=True)
 
     def _replace_model(self, parameters: NodeParameters) -> None:
         """Load another checkpoint beside the one that runs, and swap them between two sets; the family's errors."""
         parameters.check_complete()
-        estimator = parameters.build_estimator()
+        estimator = self._built_estimator(parameters)
         if self._session is not None:
             self._session.set_model(estimator)
         self._settings, self._estimator = parameters, estimator
-        self.get_logger().info(f"model: {estimator.model_id} on {estimator.device}")
+        return_memory()
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -226,24 +235,20 @@ def main(args: Sequence[str] | None = None) -> None:
         node = SurroundDepthNode()
     except Exception as error:  # rclpy raises many kinds for a parameter override that is wrong
         sys.exit(f"surround_depth_node: {str(error).splitlines()[0]}")
-    try:
+    with node.survives_errors():
         node.autostart()
-        rclpy.spin(node)
-    except Exception:
-        # A signal invalidates the context at once, and so whatever a callback has just asked rclpy for.
-        if rclpy.ok():
-            raise
+    node.spin()
     _end(node)
 
 
 def _end(node: SurroundDepthNode) -> None:
-    """Stop within two seconds, also in the middle of inference."""
+    """Stop within two seconds, also in the middle of inference or of building a network."""
     # `ros2 launch` sends SIGINT to the group and again to each child; the second must not break the clean-up.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     finished = node.stop()
-    if not finished:
-        # A thread inside an inference cannot be stopped; leaving at once is safe, for its set is not published.
+    if node.is_abandoned or not finished:
+        # A thread inside an inference or a compiler cannot be stopped; leaving is safe, for nothing of it is published.
         os._exit(0)
     node.destroy_node()
     rclpy.try_shutdown()

@@ -12,7 +12,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Future
+from concurrent.futures import CancelledError, Future
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -70,6 +70,7 @@ class SurroundPipeline:
         self._observe = observe
         self._latencies = latencies
         self._surround: Future[SurroundDepthEstimator] | None = None
+        self._last_built: SurroundDepthEstimator | None = None
         self._pace = _InferencePace()
         self._warm_up = threading.Lock()
         self._is_warm = False
@@ -97,18 +98,18 @@ class SurroundPipeline:
     def set_rig(self, rig: Rig | None) -> None:
         """Use these calibrations and cameras from now on; None: no set can be used until there is a rig again."""
         former = self._surround
-        if rig is None:
-            self._surround = None
-        else:
-            self._surround = self._preparer.pool.submit(self._build_surround, rig, self._estimator, former)
+        self._surround = None if rig is None else self._preparer.pool.submit(self._build_surround, rig, self._estimator)
+        if former is not None:
+            former.cancel()  # whoever sends new calibrations faster than maps can be built piles nothing up
 
     def set_model(self, estimator: DepthPredictor) -> None:
         """Use another network from the next set on; its maps are built here, while the former one still runs."""
         self._estimator = estimator
         former = self._usable_surround()
         if former is not None:
+            self._last_built = SurroundDepthEstimator(former.rig, estimator, former)
             self._surround = Future()
-            self._surround.set_result(SurroundDepthEstimator(former.rig, estimator, former))
+            self._surround.set_result(self._last_built)
 
     def add(self, camera: str, message: Any) -> None:
         """Take an image message in; quick, for whoever receives them all."""
@@ -124,8 +125,9 @@ class SurroundPipeline:
         """Stop; False when a thread is still inside its last set a second later."""
         self._mailbox.close()
         self._preparer.close()
+        deadline = time.monotonic() + _JOIN_SECONDS
         for thread in self._threads:
-            thread.join(_JOIN_SECONDS)
+            thread.join(max(0.0, deadline - time.monotonic()))
         return not any(thread.is_alive() for thread in self._threads)
 
     def _prepare_ahead(self, image: CameraImage) -> None:
@@ -137,12 +139,9 @@ class SurroundPipeline:
         if rectifier is not None and self._pace.is_free_within(self._watches[image.camera].interval):
             self._preparer.prepare(image, rectifier)
 
-    def _build_surround(
-        self, rig: Rig, estimator: DepthPredictor, former: Future[SurroundDepthEstimator] | None
-    ) -> SurroundDepthEstimator:
+    def _build_surround(self, rig: Rig, estimator: DepthPredictor) -> SurroundDepthEstimator:
         """Build the maps, taking over those of the cameras that have not changed; at first, warm the network up."""
-        known = former.result() if former is not None and former.done() and not former.exception() else None
-        surround = SurroundDepthEstimator(rig, estimator, known)
+        surround = self._last_built = SurroundDepthEstimator(rig, estimator, self._last_built)
         with self._warm_up:
             if not self._is_warm:
                 surround.warm_up()
@@ -194,8 +193,12 @@ class SurroundPipeline:
         self._estimates.put(PublishedSet(surround_set, surround.rig, depth))
 
     def _usable_surround(self) -> SurroundDepthEstimator | None:
-        surround = self._surround
-        return None if surround is None or surround.exception() else surround.result()
+        while (surround := self._surround) is not None:
+            try:
+                return None if surround.exception() else surround.result()
+            except CancelledError:
+                continue  # another has taken its place
+        return None
 
     def _pictures(
         self, wanted: Mapping[str, CameraImage], rectifiers: Mapping[str, Rectifier], cameras: int

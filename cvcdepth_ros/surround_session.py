@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """What runs while the node is active: its topics tied to the pipeline, and what is known of each camera."""
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 
-from cvcdepth_core.errors import CvcDepthError, TransformError
+from cvcdepth_core.errors import CvcDepthError
 from cvcdepth_core.estimator import DepthEstimator
 from cvcdepth_core.overlap_monitor import OverlapMonitor
 from cvcdepth_core.rig import Rig, RigLayout
@@ -44,8 +45,6 @@ class SurroundSession:
         self._estimator = estimator
         self._assembler = RigAssembler(layout)
         self._complete: list[str] = []
-        self._trace = TraceFile(Path(parameters.trace).expanduser()) if parameters.trace else None
-        self.latencies = StageLatencies(self._trace)
         self._synchroniser: SurroundSynchronizer[CameraImage] = SurroundSynchronizer.of_rig(
             layout, parameters.tolerance, parameters.queue_size, parameters.min_cameras
         )
@@ -53,20 +52,32 @@ class SurroundSession:
         self._watches = {name: CameraWatch(parameters.stale_after, parameters.frozen_after) for name in layout.names}
         self._overlaps: OverlapMonitor | None = None
         self._monitored_rig: Rig | None = None
-        self._transforms = self._listen_for_transforms()
-        self._outputs = SurroundOutputs(node, layout.names, parameters.depth_encoding, self.latencies)
-        self._pipeline = SurroundPipeline(
-            estimator,
-            self._synchroniser,
-            self._mailbox,
-            self._watches,
-            self._outputs.wanted,
-            self._publish,
-            self._watch_overlaps if parameters.overlap_monitor else lambda _: None,
-            self.latencies,
-        )
-        self._inputs = CameraInputs(node, layout, parameters.reliable, self._on_image, self._on_camera_info)
-        self._rebuild()
+        self._is_finished = False
+        with ExitStack() as opened:
+            trace = TraceFile(Path(parameters.trace).expanduser()) if parameters.trace else None
+            if trace is not None:
+                opened.callback(trace.close)
+            self.latencies = StageLatencies(trace)
+            if any(camera.base_T_camera is None for camera in layout.cameras):
+                transforms = StaticTransformInput(node, self._assembler.transforms, self._on_transforms)
+                opened.callback(transforms.close)
+            self._outputs = SurroundOutputs(node, layout.names, parameters.depth_encoding, self.latencies)
+            opened.callback(self._outputs.close)
+            self._pipeline = SurroundPipeline(
+                estimator,
+                self._synchroniser,
+                self._mailbox,
+                self._watches,
+                self._outputs.wanted,
+                self._publish,
+                self._watch_overlaps if parameters.overlap_monitor else lambda _: None,
+                self.latencies,
+            )
+            opened.callback(self._close_pipeline)
+            self._inputs = CameraInputs(node, layout, parameters.reliable, self._on_image, self._on_camera_info)
+            opened.callback(self._inputs.close)
+            self._rebuild()
+            self._opened = opened.pop_all()
 
     def poll(self) -> None:
         """Subscribe image topics that have appeared."""
@@ -80,15 +91,8 @@ class SurroundSession:
 
     def close(self) -> bool:
         """Stop everything; False when a thread is still busy with its last set a second later."""
-        self._inputs.close()
-        if self._transforms is not None:
-            self._transforms.close()
-        finished = self._pipeline.close()
-        if self._trace is not None:
-            self._trace.close()
-        if finished:
-            self._outputs.close()
-        return finished
+        self._opened.close()
+        return self._is_finished
 
     def conditions(self) -> dict[str, CameraCondition]:
         """Say for each camera how it fares."""
@@ -137,10 +141,8 @@ class SurroundSession:
         ]
         return [(state, reason) for state, reason in reasons if reason]
 
-    def _listen_for_transforms(self) -> StaticTransformInput | None:
-        if all(camera.base_T_camera is not None for camera in self._assembler.layout.cameras):
-            return None
-        return StaticTransformInput(self._node, self._on_transforms)
+    def _close_pipeline(self) -> None:
+        self._is_finished = self._pipeline.close()
 
     def _on_image(self, camera: str, message: Any) -> None:
         self.latencies.record("receive (ROS time)", (self._ros_time() - stamp_ns(message)) / 1e9)
@@ -150,11 +152,7 @@ class SurroundSession:
         if self._assembler.add_camera_info(camera, message):
             self._rebuild()
 
-    def _on_transforms(self, message: Any) -> None:
-        try:
-            self._assembler.transforms.add_message(message)
-        except TransformError as error:
-            self._node.get_logger().error(f"/tf_static: {error}")
+    def _on_transforms(self) -> None:
         if self._complete_cameras() != self._complete:
             self._rebuild()
 

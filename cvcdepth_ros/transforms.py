@@ -6,7 +6,7 @@ Messages are taken by their attributes, so rclpy's objects and those of a record
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,16 @@ _SHOWN = 20
 def frame_name(frame_id: str) -> str:
     """Return the frame id without the leading slash that tf1 and some drivers write."""
     return frame_id.lstrip("/")
+
+
+class Link(NamedTuple):
+    """One transform."""
+
+    stamp: int
+    """ns."""
+    parent: str
+    child: str
+    parent_T_child: Pose
 
 
 class TransformTree:
@@ -61,9 +71,20 @@ class TransformTree:
         self._parents[child] = parent, np.array(parent_T_child, dtype=np.float64)
 
     def add_message(self, message: Any) -> None:
-        """Add the transforms of a `tf2_msgs/TFMessage`; raises TransformError like `add`, and for a bad quaternion."""
-        for _, parent, child, parent_T_child in links_of(message):
-            self.add(parent, child, parent_T_child)
+        """Add the transforms of a `tf2_msgs/TFMessage`.
+
+        Raises TransformError for the first that cannot be added, as in `add` or for a bad quaternion, when all others
+        have been: who publishes all of a vehicle's transforms in one message must not lose them to a single one.
+        """
+        errors = []
+        for link in message.transforms:
+            try:
+                _, parent, child, parent_T_child = link_of(link)
+                self.add(parent, child, parent_T_child)
+            except TransformError as error:
+                errors.append(error)
+        if errors:
+            raise errors[0]
 
     def lookup(self, target_frame: str, source_frame: str) -> Pose:
         """Return target_T_source [4, 4], which takes points of the source frame to the target frame.
@@ -71,12 +92,12 @@ class TransformTree:
         Raises TransformError, naming the frame that is missing and those that are known, when nothing connects them.
         """
         target, source = frame_name(target_frame), frame_name(source_frame)
-        known = self.frames
+        known = self._shown_frames()
         for frame in (target, source):
             if frame in self.refused:
                 raise TransformError(f"no transform {target} <- {source}: {self.refused[frame]}")
         for frame in (target, source):
-            if frame not in known:
+            if frame not in self.frames:
                 raise TransformError(
                     f"no transform {target} <- {source}: frame '{frame}' is unknown; known are {known}"
                 )
@@ -95,6 +116,11 @@ class TransformTree:
         while chain[-1] in self._parents:
             chain.append(self._parents[chain[-1]][0])
         return chain
+
+    def _shown_frames(self) -> str:
+        frames = self.frames
+        more = f" and {len(frames) - _SHOWN} more" if len(frames) > _SHOWN else ""
+        return f"{frames[:_SHOWN]}{more}"
 
     def _to_root(self, frame: str) -> tuple[str, Pose]:
         *links, root = self.ancestors(frame)
@@ -168,18 +194,22 @@ class PoseTrack:
         del self._stamps[:needed], self._poses[:needed]
 
 
-def links_of(message: Any) -> Iterator[tuple[int, str, str, Pose]]:
-    """Give stamp (ns), parent, child and parent_T_child of every transform of a TFMessage."""
-    for link in message.transforms:
-        stamp = link.header.stamp.sec * 10**9 + link.header.stamp.nanosec
-        parent, child = frame_name(link.header.frame_id), frame_name(link.child_frame_id)
-        if max(len(parent), len(child)) > _MAX_NAME:
-            raise TransformError(
-                f"frame '{max(parent, child, key=len):.40}...' has a name of more than {_MAX_NAME} letters"
-            )
-        t, q = link.transform.translation, link.transform.rotation
-        pose = pose_from_quaternion((t.x, t.y, t.z), (q.x, q.y, q.z, q.w), f"transform {parent} <- {child}")
-        yield stamp, parent, child, pose
+def links_of(message: Any) -> Iterator[Link]:
+    """Give every transform of a TFMessage; TransformError as `link_of`."""
+    return map(link_of, message.transforms)
+
+
+def link_of(transform: Any) -> Link:
+    """Take a TransformStamped apart; TransformError for a bad quaternion or an endless name."""
+    stamp = transform.header.stamp.sec * 10**9 + transform.header.stamp.nanosec
+    parent, child = frame_name(transform.header.frame_id), frame_name(transform.child_frame_id)
+    if max(len(parent), len(child)) > _MAX_NAME:
+        raise TransformError(
+            f"frame '{max(parent, child, key=len):.40}...' has a name of more than {_MAX_NAME} letters"
+        )
+    t, q = transform.transform.translation, transform.transform.rotation
+    pose = pose_from_quaternion((t.x, t.y, t.z), (q.x, q.y, q.z, q.w), f"transform {parent} <- {child}")
+    return Link(stamp, parent, child, pose)
 
 
 def _interpolated(start: Pose, end: Pose, fraction: float) -> Pose:

@@ -3,7 +3,7 @@
 
     python tools/soak.py --minutes 60 --output output/soak.json
 
-The faults are those of tests/ros/test_node_faults.py, each for some seconds, in an order that `--seed` decides. The run
+The faults are those of tests/ros/camera_faults.py, each for some seconds, in an order that `--seed` decides. The run
 fails when the node ends, when its memory grows by more than 2 % after five minutes (10 % in shorter runs), when its
 files or threads become more, or when a depth image carries a stamp that its camera has not sent, or one twice.
 """
@@ -24,15 +24,9 @@ from typing import Any
 ROOT = Path(__file__).parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "tests" / "ros")]
 
-import recordings  # noqa: E402
+from camera_faults import FAULTS  # noqa: E402
+from camera_scene import DEPTH, Scene, running_scene, stamp_of  # noqa: E402
 from recordings import CAMERAS  # noqa: E402
-from ros_graph import RosGraph  # noqa: E402
-from test_camera_failures import DEPTH, Scene, stamp_of  # noqa: E402
-from test_node_faults import FAULTS  # noqa: E402
-
-from cvcdepth_core.rig import save_rig_layout  # noqa: E402
-from cvcdepth_ros.bags import open_recording  # noqa: E402
-from cvcdepth_ros.recorded_rig import discover_rig  # noqa: E402
 
 SETTLED = 300.0
 """Seconds until memory has to stay as it is."""
@@ -78,14 +72,8 @@ _QUARTER = 4
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run, write the result, and return 1 when something was wrong."""
     options = _options(arguments)
-    graph = RosGraph()
-    try:
-        with tempfile.TemporaryDirectory() as folder:
-            scene = Scene(graph, _rig(Path(folder) / "rig.yaml"))
-            scene.await_cameras(list(CAMERAS))
-            soak = _run(scene, options.minutes * 60, random.Random(options.seed), Soak(options.seed))
-    finally:
-        graph.close()
+    with tempfile.TemporaryDirectory() as folder, running_scene(Path(folder)) as scene:
+        soak = _run(scene, options.minutes * 60, random.Random(options.seed), Soak(options.seed))
     problems = soak.problems(min(SETTLED, options.minutes * 60 / 3))
     result = vars(soak) | {"problems": problems}
     options.output.parent.mkdir(parents=True, exist_ok=True)
@@ -103,24 +91,13 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
-def _rig(path: Path) -> Path:
-    """Write the sample's rig without calibrations, which come from the topics and can therefore be spoiled."""
-    with open_recording(recordings.SAMPLE) as recording:
-        layout = discover_rig(recording)
-    found = {camera.name: camera for camera in layout.cameras}
-    cameras = tuple(found[name].model_copy(update={"calibration": None}) for name in CAMERAS)
-    save_rig_layout(path, layout.model_copy(update={"cameras": cameras, "anchor": CAMERAS[0]}))
-    return path
-
-
 def _run(scene: Scene, seconds: float, choose: random.Random, soak: Soak) -> Soak:
-    process = scene.graph._processes[0][0]
     begin = time.monotonic()
     change_at, due, next_sample = begin, begin, begin
     seen: dict[str, list[int]] = {name: [] for name in CAMERAS}
     while (now := time.monotonic()) - begin < seconds:
-        if process.poll() is not None:
-            soak.wrong_stamps.append(f"the node ended with {process.poll()}: {scene.graph.log()[-500:]}")
+        if scene.node.poll() is not None:
+            soak.wrong_stamps.append(f"the node ended with {scene.node.poll()}: {scene.graph.log()[-500:]}")
             break
         if now >= change_at:
             change_at = now + _change(scene, choose, soak)
@@ -130,7 +107,7 @@ def _run(scene: Scene, seconds: float, choose: random.Random, soak: Soak) -> Soa
         scene.graph.spin(max(0.001, due - time.monotonic()))
         _check_stamps(scene, seen, soak)
         if now >= next_sample:
-            soak.samples.append((now - begin, *_of_process(process.pid)))
+            soak.samples.append((now - begin, *scene.node.resources()))
             next_sample = now + 1.0
     soak.seconds = time.monotonic() - begin
     return soak
@@ -170,13 +147,6 @@ def _check_stamps(scene: Scene, seen: dict[str, list[int]], soak: Soak) -> None:
         )
     for topic in set(scene.graph.received) - set(DEPTH.values()):
         del scene.graph.received[topic][:-1]
-
-
-def _of_process(pid: int) -> tuple[float, int, int]:
-    """Return resident MiB, open files and threads."""
-    folder = Path(f"/proc/{pid}")
-    resident = int(folder.joinpath("statm").read_text().split()[1]) * 4096 / 2**20
-    return resident, len(list(folder.joinpath("fd").iterdir())), len(list(folder.joinpath("task").iterdir()))
 
 
 def _median(values: Sequence[float]) -> Any:

@@ -8,11 +8,13 @@ from typing import NamedTuple
 class Row(NamedTuple):
     """One fault."""
 
-    kind: str
     name: str
-    where: str
+    given_to: str
     reaction: str
-    seconds: float
+    told: float
+    """Seconds until it was reported."""
+    recovered: float | None
+    """Seconds from its end until all was well again; None where nothing goes on."""
 
 
 class FaultTable:
@@ -21,15 +23,22 @@ class FaultTable:
     def __init__(self) -> None:
         self._rows: list[Row] = []
 
-    def add(self, kind: str, name: str, where: str, reaction: str, seconds: float) -> None:
-        self._rows.append(Row(kind, name, where, " ".join(reaction.split()), seconds))
+    def add(self, name: str, given_to: str, reaction: str, told: float, recovered: float | None = None) -> None:
+        self._rows.append(Row(name, given_to, " ".join(reaction.split()), told, recovered))
 
     def write(self, path: Path) -> None:
         """Append the rows as a Markdown table."""
-        lines = ["| fault | given to | reaction | seconds |", "|---|---|---|---|"]
-        lines += [f"| {r.name} | {r.where} | {_shortened(r.reaction)} | {r.seconds:.1f} |" for r in self._rows]
+        lines = ["| fault | given to | reaction | told after (s) | well again after (s) |", "|---|---|---|---|---|"]
+        lines += [
+            f"| {row.name} | {row.given_to} | {_shortened(row.reaction)} | {row.told:.1f} | {_seconds(row.recovered)} |"
+            for row in self._rows
+        ]
         with path.open("a") as file:
             file.write("\n".join(lines) + "\n\n")
+
+
+def _seconds(value: float | None) -> str:
+    return "" if value is None else f"{value:.1f}"
 
 
 def _shortened(text: str) -> str:

@@ -366,7 +366,7 @@ def test_the_tool_meets_the_fault_with_one_line_or_a_result_that_tells_it(
         if code
         else f"exit 0, tells `{fault.says}`"
     )
-    fault_table.add("tool", name, f"`cvcdepth {arguments[0]}`", answer, time.monotonic() - clock)
+    fault_table.add(name, f"`cvcdepth {arguments[0]}`", answer, time.monotonic() - clock)
 
 
 def test_a_rig_files_tags_name_no_functions():

@@ -21,7 +21,7 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
@@ -45,6 +45,14 @@ def reliable(depth: int = 100, latched: bool = False) -> QoSProfile:
 
 def best_effort(depth: int = 10) -> QoSProfile:
     return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+class Resources(NamedTuple):
+    """What a process holds."""
+
+    resident_mib: float
+    files: int
+    threads: int
 
 
 class NodeProcess:
@@ -78,6 +86,12 @@ class NodeProcess:
 
     def kill(self) -> None:
         self._process.kill()
+
+    def resources(self) -> Resources:
+        """Return what it holds now."""
+        folder = Path(f"/proc/{self.pid}")
+        resident = int(folder.joinpath("statm").read_text().split()[1]) * 4096 / 2**20
+        return Resources(resident, *(len(list(folder.joinpath(kind).iterdir())) for kind in ("fd", "task")))
 
 
 def _run_node(arguments: Sequence[str], environment: dict[str, str], log: Path) -> None:
@@ -119,6 +133,7 @@ class RosGraph:
         ]
         options = itertools.chain.from_iterable(("-p", pair) for pair in pairs)
         log = self._folder / f"{len(self._processes)}.log"
+        log.touch()
         environment = os.environ | {"ROS_DOMAIN_ID": str(self.domain)}
         process = NodeProcess(["--ros-args", *options, *arguments], environment, log)
         self._processes.append((process, log))

@@ -9,13 +9,8 @@ import pytest
 
 pytest.importorskip("rclpy", reason="these tests need a ROS environment")
 
-from recordings import CAMERAS, SAMPLE
+from camera_scene import running_scene
 from ros_graph import RosGraph
-from test_camera_failures import Scene
-
-from cvcdepth_core.rig import save_rig_layout
-from cvcdepth_ros.bags import open_recording
-from cvcdepth_ros.recorded_rig import discover_rig
 
 POLICY = Path(__file__).parents[2] / "security" / "policies" / "surround_depth.policy.xml"
 ONLY_SOMETIMES = {"/clock", "/tf_static"}
@@ -23,15 +18,8 @@ ONLY_SOMETIMES = {"/clock", "/tf_static"}
 
 @pytest.fixture(scope="module")
 def graph(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RosGraph]:
-    rig = tmp_path_factory.mktemp("rig") / "rig.yaml"
-    with open_recording(SAMPLE) as recording:
-        save_rig_layout(rig, discover_rig(recording))
-    graph = RosGraph()
-    try:
-        Scene(graph, rig).await_cameras(list(CAMERAS))
-        yield graph
-    finally:
-        graph.close()
+    with running_scene(tmp_path_factory.mktemp("rig")) as scene:
+        yield scene.graph
 
 
 def granted(kind: str, how: str, item: str) -> set[str]:

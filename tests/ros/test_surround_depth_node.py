@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node as its users meet it: a process that is fed and read over DDS."""
 
-import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,8 +13,6 @@ import yaml
 
 pytest.importorskip("rclpy", reason="these tests need a ROS environment")
 
-from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
@@ -347,36 +344,6 @@ def test_what_cannot_start_is_one_line_and_a_diagnostic(parameters, reason, grap
     assert len([line for line in graph.log().splitlines() if "[ERROR]" in line]) == 1
 
 
-def change_state(graph: RosGraph, transition: int) -> bool:
-    client = graph.node.create_client(ChangeState, "/surround_depth/change_state")
-    assert client.wait_for_service(20)
-    future = client.call_async(ChangeState.Request(transition=Transition(id=transition)))
-    graph.spin_until(future.done, "the transition")
-    return bool(future.result().success)
-
-
-def test_a_lifecycle_manager_can_drive_the_node(graph, messages, rig_content, tmp_path):
-    feed = Feed(graph, messages)
-    depth = "/surround_depth/front/depth/image_rect"
-    graph.subscribe(Image, depth)
-    graph.start_node(rig=write_rig(tmp_path, rig_content), autostart=False, **SMALL)
-    graph.await_status("node", "unconfigured")
-    for _ in range(2):
-        assert change_state(graph, Transition.TRANSITION_CONFIGURE)
-        assert change_state(graph, Transition.TRANSITION_ACTIVATE)
-        graph.received[depth].clear()
-        feed.publish_until(lambda: graph.received[depth], "depth while active")
-        assert change_state(graph, Transition.TRANSITION_DEACTIVATE)
-        graph.await_status("node", "inactive")
-        assert change_state(graph, Transition.TRANSITION_CLEANUP)
-        graph.await_status("node", "unconfigured")
-    state = graph.node.create_client(GetState, "/surround_depth/get_state")
-    assert state.wait_for_service(20)
-    future = state.call_async(GetState.Request())
-    graph.spin_until(future.done, "the state")
-    assert future.result().current_state.label == "unconfigured"
-
-
 def set_parameter(graph: RosGraph, name: str, value: Any) -> Any:
     client = graph.node.create_client(SetParameters, "/surround_depth/set_parameters")
     assert client.wait_for_service(20)
@@ -423,19 +390,6 @@ def test_another_checkpoint_is_loaded_while_running_and_a_bad_one_is_refused(gra
     graph.received[topic].clear()
     feed.publish_until(lambda: graph.received[topic], "depth of the second network")
     assert bytes(graph.received[topic][-1].data) != former
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_node_also_in_the_middle_of_inference(number, graph, messages, rig_content, tmp_path):
-    feed = Feed(graph, messages)
-    graph.subscribe(Image, "/surround_depth/front/depth/image_rect")
-    # Large enough that one set takes seconds: the signal comes while the worker computes.
-    process = graph.start_node(rig=write_rig(tmp_path, rig_content), **(SMALL | {"height": 576, "width": 1024}))
-    graph.await_subscribers([f"/camera/{name}/image_raw/compressed" for name in CAMERAS])
-    feed.publish_until(lambda: int(graph.values("synchronisation").get("delivered", 0)), "a set in the worker")
-    process.send_signal(number)
-    assert process.wait(60) == 0, graph.log()
-    assert "Traceback" not in graph.log()
 
 
 def test_old_sets_are_dropped_and_counted_when_ros_time_has_moved_on(graph, messages, rig_content, tmp_path):

@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A managed (lifecycle) node that a fault of its own code, or of whoever manages it, does not end."""
+
+import traceback
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import contextmanager
+from functools import partial
+from typing import Any, TypeVar
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
+
+from cvcdepth_core.errors import CvcDepthError
+
+T = TypeVar("T")
+
+_INTERRUPTION_SECONDS = 0.1
+
+
+class ManagedNode(LifecycleNode):  # type: ignore[misc] # rclpy is not annotated
+    """rclpy's managed node, with answers where that has none.
+
+    There, the request for a transition that the state does not allow raises in the service's callback, which ends the
+    process and leaves the client without an answer; and the reason for a transition's failure is lost.
+    """
+
+    def __init__(self, name: str, **options: Any) -> None:
+        """`options` are those of rclpy's Node."""
+        super().__init__(name, **options)
+        self.failure = ""
+        """Why the last transition failed; empty when it did not."""
+        self.errors = 0
+        """Callbacks that raised what nobody foresaw."""
+        self.is_abandoned = False
+        """Whether a thread is still busy that nobody waits for any more."""
+        for service in self.services:
+            if service.srv_name.endswith("/change_state"):
+                service.callback = partial(self._answer_change_state, service.callback)
+
+    def spin(self) -> None:
+        """Serve until the context ends."""
+        while self.context.ok():
+            with self.survives_errors():
+                rclpy.spin(self, SingleThreadedExecutor(context=self.context))
+
+    @contextmanager
+    def survives_errors(self) -> Iterator[None]:
+        """Leave the block at an error, with the error in the log."""
+        try:
+            yield
+        except Exception as error:
+            self.report(error)
+
+    def report(self, error: Exception) -> str:
+        """Log and count what nobody foresaw; return it as a reason."""
+        # A signal invalidates the context at once, and so whatever a callback has just asked rclpy for.
+        if self.context.ok():
+            self.errors += 1
+            self.get_logger().error("".join(traceback.format_exception(error)), throttle_duration_sec=5.0)
+        return f"{type(error).__name__}: {error}"
+
+    def attempt(self, transition: Callable[[], None]) -> TransitionCallbackReturn:
+        """Make a transition: FAILURE with the reason for the family's errors, error processing for all others."""
+        try:
+            transition()
+        except CvcDepthError as error:
+            self.failure = str(error)
+            self.get_logger().error(self.failure)
+            return TransitionCallbackReturn.FAILURE
+        except Exception as error:
+            self.failure = self.report(error)
+            return TransitionCallbackReturn.ERROR
+        self.failure = ""
+        return TransitionCallbackReturn.SUCCESS
+
+    def wait_for(self, work: Callable[[], T]) -> T:
+        """Return what `work` returns; as soon as the node is to end, abandon it and raise InterruptedError."""
+        pool = ThreadPoolExecutor(1, thread_name_prefix="build")
+        future = pool.submit(work)
+        pool.shutdown(wait=False)
+        while not wait([future], _INTERRUPTION_SECONDS).done:
+            if not self.context.ok():
+                self.is_abandoned = True
+                raise InterruptedError("the node ends")
+        return future.result()
+
+    def _answer_change_state(self, handle: Callable[[Any, Any], Any], request: Any, response: Any) -> Any:
+        try:
+            return handle(request, response)
+        except Exception as error:  # rclpy's RCLError, which has no public name
+            asked = request.transition.label or request.transition.id
+            self.get_logger().warning(f"transition {asked} is impossible now: {error}", throttle_duration_sec=5.0)
+            response.success = False
+            return response

@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Quality of service of the node's topics, each of which `qos_overrides` can change."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+from cvcdepth_core.errors import ConfigError
+
+_INPUT_DEPTH = 10
+
+
+def input_qos(reliable: bool) -> QoSProfile:
+    """Sensor-data QoS with room for one second of a 10 Hz camera, or the same reliably."""
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=_INPUT_DEPTH,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.VOLATILE,
+    )
+
+
+@contextmanager
+def refusing_impossible_qos(topic: str) -> Iterator[None]:
+    """Turn what rclpy raises for the qos_overrides of `topic`, in many kinds, into a ConfigError that names it."""
+    try:
+        yield
+    except Exception as error:
+        raise ConfigError(f"{topic}: {error}; see its qos_overrides") from error
