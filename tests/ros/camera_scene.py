@@ -56,10 +56,13 @@ class Cameras:
             image.header = copy.deepcopy(image.header)
             image.header.stamp.sec, image.header.stamp.nanosec = divmod(stamp, SECOND)
             image = self.faults.get(name, lambda image: image)(image)
-            self._info[name].publish(self.infos[name])
+            self.publish_info(name)
             if image is not None:
                 self.sent[name].add(stamp_of(image))
                 self._images[name].publish(image)
+
+    def publish_info(self, name: str) -> None:
+        self._info[name].publish(self.infos[name])
 
     def run_until(self, condition: Callable[[], object], what: str) -> None:
         def step() -> bool:

@@ -2,6 +2,7 @@
 """Cameras that die, freeze, change and return while the node runs: what is published and what is said. One node."""
 
 import copy
+import itertools
 import json
 from collections.abc import Iterator
 from typing import Any
@@ -108,6 +109,27 @@ def test_a_camera_that_changes_its_calibration_goes_on_with_the_new_one(scene):
     )
     scene.cameras.infos["left"] = good
     scene.cameras.run_until(lambda: received[-1].k[0] == pytest.approx(good.k[0] * 96 / 960), "the old one")
+
+
+def test_a_camera_whose_calibration_changes_with_every_image_holds_up_no_other(scene):
+    good = scene.cameras.good_infos["left"]
+    wider = copy.deepcopy(good)
+    wider.k[0] = wider.k[4] = wider.p[0] = wider.p[5] = good.k[0] / 2
+    both = itertools.cycle([wider, good])
+
+    def recalibrated(image: Any) -> Any:
+        for _ in range(20):
+            scene.cameras.infos["left"] = next(both)
+            scene.cameras.publish_info("left")
+        return image
+
+    before = scene.node.resources()
+    scene.fail(left=recalibrated)
+    topic = DEPTH["right"]
+    for _ in range(5):
+        scene.graph.received[topic].clear()
+        scene.cameras.run_until(lambda: len(scene.graph.received[topic]) > 5, "depth of another camera")
+    assert scene.node.resources().resident_mib < before.resident_mib + 200
 
 
 def test_a_camera_whose_clock_jumps_away_is_told_and_left_out(scene):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node as its users meet it: a process that is fed and read over DDS."""
 
+import copy
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +14,7 @@ import yaml
 
 pytest.importorskip("rclpy", reason="these tests need a ROS environment")
 
+from geometry_msgs.msg import TransformStamped
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
@@ -20,6 +22,7 @@ from rclpy.serialization import deserialize_message
 from recordings import CAMERAS, JAZZY, sample_entries
 from ros_graph import RosGraph, best_effort, reliable
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
+from std_msgs.msg import Header
 
 from cvcdepth_core.checkpoint import DepthModelSpec, save_checkpoint
 from cvcdepth_core.networks import DepthNet
@@ -212,6 +215,28 @@ def test_a_missing_transform_is_named_and_awaited(graph, messages, rig_content, 
     feed.publish_until(
         lambda: graph.received["/surround_depth/front/depth/image_rect"], "depth once the poses are there"
     )
+
+
+def test_transforms_that_make_no_tree_are_refused_by_name_and_the_others_taken(graph, messages):
+    tf2_msgs = pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not built here (make tf2_msgs)")
+    good = transform_message(tf2_msgs, messages)
+    links = [("turntable", "turntable"), ("base_link", "rack"), ("rack", "base_link"), ("base_link", "n" * 300)]
+    bad = [TransformStamped(child_frame_id=child, header=Header(frame_id=parent)) for parent, child in links]
+    bad += copy.deepcopy([good.transforms[0]] * 2)
+    bad[-2].transform.rotation.w, bad[-2].child_frame_id = 7.0, "stretched"
+    bad[-1].transform.translation.x, bad[-1].child_frame_id = float("nan"), "nowhere"
+    transforms = graph.node.create_publisher(tf2_msgs.TFMessage, "/tf_static", reliable(latched=True))
+    transforms.publish(tf2_msgs.TFMessage(transforms=[*bad, *good.transforms]))
+    # The transforms are there before the cameras, and again after them.
+    graph.start_node(rig="auto", **SMALL)
+    graph.spin_until(lambda: "transform turntable <- turntable closes a loop" in graph.log(), "the loop in the log")
+    feed = Feed(graph, messages)
+    graph.subscribe(PointCloud2, "/surround_depth/points")
+    feed.publish_until(lambda: graph.received["/surround_depth/points"], "a merged cloud")
+    transforms.publish(tf2_msgs.TFMessage(transforms=[*bad, *good.transforms]))
+    graph.received["/surround_depth/points"].clear()
+    feed.publish_until(lambda: graph.received["/surround_depth/points"], "another cloud")
+    assert "Traceback" not in graph.log()
 
 
 def transform_message(tf2_msgs: Any, messages: dict[str, list[Any]]) -> Any:
