@@ -14,7 +14,7 @@ from cvcdepth_core.checkpoint import DepthModelSpec, load_checkpoint
 from cvcdepth_core.engines import Precision, build_engine
 from cvcdepth_core.images import Picture
 from cvcdepth_core.networks import DepthNet, disparity_to_depth
-from cvcdepth_core.preprocess import SurroundPreprocessor, to_tensor
+from cvcdepth_core.preprocess import SurroundPreprocessor
 from cvcdepth_core.rig import Rig
 
 
@@ -70,12 +70,12 @@ class DepthEstimator:
         device: str = "auto",
         backend: str = "auto",
         precision: Precision = "float32",
-        cpu_without_memory: bool = False,
+        cpu_fallback: bool = False,
     ) -> None:
         """`weights_id` is what reports call the weights; for the rest, and the errors raised, see `build_engine`."""
         self.spec = spec
         self.weights_id = weights_id
-        self._engine = build_engine(network, spec, device, backend, precision, cpu_without_memory)
+        self._engine = build_engine(network, spec, device, backend, precision, cpu_fallback)
 
     @classmethod
     def from_checkpoint(cls, path: Path, device: str = "auto", **engine: Any) -> "DepthEstimator":
@@ -108,18 +108,18 @@ class DepthEstimator:
     def estimate(self, pictures: Sequence[Picture], fx: NDArray[np.float64]) -> NDArray[np.float32]:
         """Return depth [N, H, W] in metres of RGB pictures [H, W, 3]; `fx` [N] is in pixels of those pictures.
 
-        On a CPU a picture's depth does not depend on the others. Raises EngineError when memory is too small.
+        On a CPU a picture's depth does not depend on the others. Raises EngineError when the device fails or has too
+        little memory.
         """
         with torch.inference_mode():
-            disparity = self._engine.disparity(to_tensor(pictures, self.device))
             depth = disparity_to_depth(
-                disparity,
-                torch.as_tensor(fx, dtype=torch.float32, device=disparity.device),
+                self._engine.disparity(pictures),
+                torch.as_tensor(fx, dtype=torch.float32),
                 self.spec.min_depth,
                 self.spec.max_depth,
                 self.spec.focal_scale,
             )
-        metres: NDArray[np.float32] = depth[:, 0].cpu().numpy()
+        metres: NDArray[np.float32] = depth[:, 0].numpy()
         return metres
 
 

@@ -48,8 +48,8 @@ class ModelSettings(Settings):
     """What runs the network: auto (on a CPU ncnn where it is installed, else torch) or one by name."""
     precision: Literal["float32", "bfloat16", "float16"] = "float32"
     """In what a CUDA device computes; CPUs know float32 only."""
-    cpu_without_memory: bool = False
-    """Go on with the CPU, more slowly, when the GPU's memory is too small even for one camera."""
+    cpu_fallback: bool = False
+    """Go on with the CPU, more slowly, when the GPU fails, or its memory is too small even for one camera."""
 
     @property
     def checkpoint_path(self) -> Path | None:
@@ -68,7 +68,7 @@ class ModelSettings(Settings):
         from cvcdepth_core.checkpoint import DepthModelSpec, check_sha256
         from cvcdepth_core.estimator import DepthEstimator
 
-        engine = self.model_dump(include={"backend", "precision", "cpu_without_memory"})
+        engine = self.model_dump(include={"backend", "precision", "cpu_fallback"})
         path = self.checkpoint_path
         if path is not None:
             check_sha256(path, self.checkpoint_sha256)

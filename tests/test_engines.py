@@ -14,8 +14,8 @@ from torch import Tensor, nn
 
 from cvcdepth_core.checkpoint import DepthModelSpec, save_checkpoint
 from cvcdepth_core.engines import BACKENDS, Precision, build_engine, is_installed, selection
-from cvcdepth_core.engines.chunks import ChunkedEngine
 from cvcdepth_core.engines.engine import DeviceMemoryError
+from cvcdepth_core.engines.guarded_engine import GuardedEngine
 from cvcdepth_core.engines.ncnn_graph import ncnn_model
 from cvcdepth_core.engines.parity import check_parity, relative_depth_error, street_like_picture
 from cvcdepth_core.engines.rewriting import RewrittenDepthNet
@@ -23,6 +23,7 @@ from cvcdepth_core.engines.torch_engine import MixedPrecision, TorchEagerEngine,
 from cvcdepth_core.errors import ConfigError, EngineError
 from cvcdepth_core.estimator import DepthEstimator
 from cvcdepth_core.networks import ENCODERS, DepthNet, disparity_to_depth
+from cvcdepth_core.preprocess import to_tensor
 from cvcdepth_ros.bag_replay import main
 from cvcdepth_ros.settings import ModelSettings
 
@@ -106,7 +107,7 @@ def test_rewriting_leaves_the_network_as_it_was():
 @pytest.mark.parametrize("backend", CPU_BACKENDS)
 def test_every_engine_gives_the_depth_of_float64(backend: str, encoder: str):
     network, spec = lively_network(encoder), spec_of(encoder)
-    engine = build_engine(network, spec, "cpu", backend)
+    engine = selection.checked_engine(network, spec, CPU, backend, "float32")
     assert backend in engine.name
     assert relative_depth_error(engine, network, spec, random_pictures(1)[0]) < 1e-4
 
@@ -180,62 +181,82 @@ def test_what_does_not_go_together_is_refused(options: dict[str, str], message: 
         build_engine(lively_network("resnet18"), spec_of("resnet18"), **({"device": "cpu"} | options))
 
 
-class SmallMemory:
-    """An engine on a device that takes `room` images at a time, and gives no numbers."""
+class FaultyDevice:
+    """An engine whose device takes `room` images at a time; there is no such device here."""
 
-    name = "small"
-    device = torch.device("meta")
+    name = "faulty"
+    device = CPU
     chunk = None
 
-    def __init__(self, room: int, error: type[Exception] = DeviceMemoryError) -> None:
+    def __init__(self, room: int, error: Exception) -> None:
         self.room, self.error, self.tried = room, error, []
 
     def disparity(self, images: Tensor) -> Tensor:
         self.tried.append(len(images))
         if len(images) > self.room:
-            raise self.error("no room\nat all")
+            raise self.error
         return images[:, :1]
 
 
-@pytest.mark.parametrize("error", [DeviceMemoryError, torch.cuda.OutOfMemoryError])
-def test_with_little_memory_cameras_go_in_smaller_chunks_and_stay_there(error: type[Exception]):
-    small = SmallMemory(2, error)
-    engine = ChunkedEngine(small)
-    assert engine.disparity(random_images(6)).shape == (6, 1, HEIGHT, WIDTH)
+NO_ROOM = DeviceMemoryError("no room\nat all")
+LOST = RuntimeError("CUDA error: unspecified launch failure\nCompile with TORCH_USE_CUDA_DSA")
+
+
+@pytest.mark.parametrize("error", [NO_ROOM, torch.cuda.OutOfMemoryError()])
+def test_with_little_memory_cameras_go_in_smaller_chunks_and_stay_there(error: Exception):
+    small = FaultyDevice(2, error)
+    engine = GuardedEngine(small)
+    assert engine.disparity(random_pictures(6)).shape == (6, 1, HEIGHT, WIDTH)
     assert small.tried == [6, 3, 1, 1, 1, 1, 1, 1]
     small.tried.clear()
-    engine.disparity(random_images(2))
+    engine.disparity(random_pictures(2))
     assert small.tried == [1, 1]
 
 
-def test_without_room_for_one_camera_it_stops_with_the_reason():
-    with pytest.raises(EngineError, match=r"small: out of memory on meta with a single image: no room$"):
-        ChunkedEngine(SmallMemory(0)).disparity(random_images(3))
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (NO_ROOM, "faulty on cpu: out of memory with a single picture: no room"),
+        (LOST, "faulty on cpu: failed: CUDA error: unspecified launch failure"),
+        (EngineError("onnxruntime: CUDA failure 700"), "faulty on cpu: failed: onnxruntime: CUDA failure 700"),
+        (RuntimeError(), "faulty on cpu: failed: RuntimeError"),
+    ],
+)
+def test_a_device_that_fails_stops_with_the_reason(error: Exception, reason: str):
+    with pytest.raises(EngineError) as found:
+        GuardedEngine(FaultyDevice(0, error)).disparity(random_pictures(3))
+    assert str(found.value) == reason
 
 
-def test_the_cpu_takes_over_only_where_that_was_wanted():
-    network = lively_network("resnet18")
-    engine = ChunkedEngine(SmallMemory(0), fallback=lambda: TorchEagerEngine(network, CPU))
+@pytest.mark.parametrize("error", [NO_ROOM, LOST])
+def test_where_that_is_wanted_the_cpu_takes_over_for_good(error: Exception):
+    network, faulty = lively_network("resnet18"), FaultyDevice(0, error)
+    engine = GuardedEngine(faulty, fallback=lambda: TorchEagerEngine(network, CPU))
+    pictures = random_pictures(2)
     with torch.inference_mode():
-        expected = torch.cat([network(image[None]) for image in random_images(2)])
-    assert torch.equal(engine.disparity(random_images(2)), expected)
+        expected = torch.cat([network(to_tensor([picture])) for picture in pictures])
+    assert torch.equal(engine.disparity(pictures), expected)
     assert engine.name.startswith("torch_eager")
+    faulty.tried.clear()
+    engine.disparity(pictures)
+    assert not faulty.tried
 
 
-def test_no_memory_on_the_fallback_either_is_an_error():
-    engine = ChunkedEngine(SmallMemory(0), fallback=lambda: SmallMemory(0))
-    with pytest.raises(EngineError, match="out of memory"):
-        engine.disparity(random_images(2))
+@pytest.mark.parametrize("error", [NO_ROOM, LOST])
+def test_a_fallback_that_fails_too_is_an_error(error: Exception):
+    engine = GuardedEngine(FaultyDevice(0, error), fallback=lambda: FaultyDevice(0, error))
+    with pytest.raises(EngineError, match=r"out of memory|launch failure"):
+        engine.disparity(random_pictures(2))
 
 
 @needs_ncnn
 def test_ncnn_gives_the_same_depth_on_any_number_of_threads(monkeypatch: pytest.MonkeyPatch):
-    images, found = random_images(5), []
+    pictures, found = random_pictures(5), []
     for threads in (1, 4):
         monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
         engine = build_engine(lively_network("resnet18"), spec_of("resnet18"), "cpu", "ncnn")
-        one_by_one = torch.cat([engine.disparity(image[None]) for image in images])
-        found += [one_by_one, engine.disparity(images), engine.disparity(images[:2])]
+        one_by_one = torch.cat([engine.disparity([picture]) for picture in pictures])
+        found += [one_by_one, engine.disparity(pictures), engine.disparity(pictures[:2])]
     assert all(torch.equal(disparity, found[0][: len(disparity)]) for disparity in found)
 
 
@@ -285,10 +306,11 @@ def test_the_settings_offer_the_backends_and_precisions_that_there_are():
 def test_cuda_engines_pass_the_parity_check(backend: str, precision: Precision):
     network = lively_network("resnet18").cuda()
     engine = build_engine(network, spec_of("resnet18"), "cuda", backend, precision)
-    first = engine.disparity(random_images(6))
+    pictures = random_pictures(6)
+    first = engine.disparity(pictures)
     kept = first.clone()
     with ThreadPoolExecutor(1) as another_thread:
-        again = another_thread.submit(engine.disparity, random_images(6).flip(0)).result()
+        again = another_thread.submit(engine.disparity, pictures[::-1]).result()
     torch.testing.assert_close(again.flip(0), first, rtol=1e-2, atol=1e-3)
     assert torch.equal(first, kept)  # a CUDA graph's own memory would have changed
 

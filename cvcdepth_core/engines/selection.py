@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal, get_args
@@ -11,8 +11,8 @@ from typing import Literal, get_args
 import torch
 
 from cvcdepth_core.checkpoint import DepthModelSpec
-from cvcdepth_core.engines.chunks import ChunkedEngine
 from cvcdepth_core.engines.engine import DisparityEngine, Precision
+from cvcdepth_core.engines.guarded_engine import GuardedEngine
 from cvcdepth_core.engines.parity import check_parity
 from cvcdepth_core.engines.torch_engine import TorchEagerEngine, TorchEngine
 from cvcdepth_core.errors import ConfigError, EngineError
@@ -38,24 +38,32 @@ def build_engine(
     device: str = "auto",
     backend: str = "auto",
     precision: Precision = "float32",
-    cpu_without_memory: bool = False,
-) -> ChunkedEngine:
+    cpu_fallback: bool = False,
+) -> GuardedEngine:
     """Make the network ready to run, and check that its depth is still the network's.
 
     `device` auto is CUDA where there is one and the backend can use it. `backend` auto is, on a CPU, ncnn where it is
-    installed, else torch. With `cpu_without_memory`, a GPU that is out of memory is replaced by the CPU.
+    installed, else torch. With `cpu_fallback`, a GPU that fails or is out of memory is replaced by the CPU.
     Raises ConfigError when the three do not go together, EngineError when the engine is not installed or gives another
     depth.
     """
     place = _place(device, backend)
-    chosen = _choose(backend, place)
-    _refuse_impossible(chosen, place, precision)
+    engine = checked_engine(network, spec, place, backend, precision)
+    fallback = partial(checked_engine, network, spec, torch.device("cpu"), "auto", "float32")
+    return GuardedEngine(engine, fallback if cpu_fallback and place.type == "cuda" else None)
+
+
+def checked_engine(
+    network: DepthNet, spec: DepthModelSpec, device: torch.device, backend: str, precision: Precision
+) -> DisparityEngine:
+    """Return the backend's engine, found to give the network's depth; errors as in `build_engine`."""
+    chosen = _choose(backend, device)
+    _refuse_impossible(chosen, device, precision)
     _refuse_missing(chosen)
-    engine = _build(chosen, network, spec, place, precision)
+    engine = _build(chosen, network, spec, device, precision)
     if chosen != "torch_eager":
         check_parity(engine, network, spec, precision)
-    fallback = _on_cpu(network, spec) if cpu_without_memory and place.type == "cuda" else None
-    return ChunkedEngine(engine, fallback)
+    return engine
 
 
 def export_onnx(network: DepthNet, spec: DepthModelSpec) -> tuple[bytes, float]:
@@ -151,7 +159,3 @@ def _build(
             return TensorRtEngine(network, spec, device, precision)
         return OnnxRuntimeEngine(network, spec, device)
     return TorchEngine(network, device, precision, compiled=backend == "torch_compiled")
-
-
-def _on_cpu(network: DepthNet, spec: DepthModelSpec) -> Callable[[], DisparityEngine]:
-    return lambda: build_engine(network, spec, "cpu")
