@@ -81,16 +81,17 @@ lock: .venv-lock/bin/uv ## resolve requirements/*.in again (LOCK=--upgrade for n
 clean: ## remove all that was installed, built or written by make
 	rm -rf .venv .venv-core .venv-lock build install log dist output/demo *.egg-info .mypy_cache .pytest_cache .ruff_cache
 
-compile = .venv-lock/bin/uv pip compile --quiet --universal --python-version 3.10 --no-annotate \
+compile = .venv-lock/bin/uv pip compile --quiet --universal --generate-hashes --python-version 3.10 --no-annotate \
 	--custom-compile-command "make lock" requirements/$(1).in --output-file requirements/$(1).lock
 
-# Wheels only, so that no compiler is ever needed; empy, pure Python, is published as source alone.
-# pip shows its progress for torch, by far the largest download, and is quiet for the rest.
+# Wheels only, so that no compiler is ever needed; empy, pure Python, is published as source alone. All that is in the
+# lock must have the lock's hash. torch comes last: then nothing of what it needs is open any more, and its own hash
+# cannot be known, for it is another file on each index. pip shows its progress for that, by far the largest download.
 define install
 @echo "Installing requirements/$(2).lock into $(1), once: about a minute, longer on a slow connection."
 @rm -rf $(1)/installed
-@$(1)/bin/pip install --only-binary :all: --constraint requirements/$(2).lock "$(TORCH)"
-@$(1)/bin/pip install -qq --only-binary :all: --no-binary empy --requirement requirements/$(2).lock
+@$(1)/bin/pip install -qq --require-hashes --no-deps --only-binary :all: --no-binary empy --requirement requirements/$(2).lock
+@$(1)/bin/pip install --only-binary :all: "$(TORCH)"
 @$(1)/bin/pip install -qq --no-deps --no-build-isolation --editable .
 @mkdir $(1)/installed && touch $@
 endef

@@ -69,9 +69,19 @@ def test_a_smaller_lock_pins_what_the_dev_lock_pins(name: str, python: str):
     assert pins(name, python) - pins("dev", python) == set()
 
 
+@pytest.mark.parametrize("name", ["dev", "demo", "core_test"])
+def test_a_lock_has_a_hash_for_whatever_it_pins(name: str):
+    assert all(" --hash=sha256:" in requirement for requirement in requirements_of(name))
+
+
 def pins(name: str, python: str) -> set[str]:
     """What the lock installs on Linux."""
     environment = {"python_version": python, "python_full_version": f"{python}.0", "sys_platform": "linux"}
-    lines = (ROOT / "requirements" / f"{name}.lock").read_text(encoding="utf-8").splitlines()
-    pinned = [Requirement(line) for line in lines if not line.startswith("#")]
+    pinned = [Requirement(line.partition(" --hash")[0]) for line in requirements_of(name)]
     return {f"{p.name}{p.specifier}" for p in pinned if p.marker is None or p.marker.evaluate(environment)}
+
+
+def requirements_of(name: str) -> list[str]:
+    """The lock's requirements, one line each."""
+    content = (ROOT / "requirements" / f"{name}.lock").read_text(encoding="utf-8").replace("\\\n", " ")
+    return [" ".join(line.split()) for line in content.splitlines() if not line.startswith("#")]
