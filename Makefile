@@ -16,6 +16,9 @@ TF2 := .venv/installed/tf2_msgs-$(shell cat tests/tf2_msgs/*.* tests/tf2_msgs/ms
 # Two tests at a time. A file's tests mostly stay in one process, which has the results that they share.
 BESIDE := -n 2 --dist worksteal
 
+NODE_FAULTS := tests/ros/test_node_faults.py tests/ros/test_lifecycle.py \
+  tests/ros/test_surround_depth_node.py::test_transforms_that_make_no_tree_are_refused_by_name_and_the_others_taken
+
 BENCHMARKS := $(filter-out measuring table camera_loop,$(basename $(notdir $(wildcard benchmarks/*.py))))
 
 # A sourced ROS 2 installation must not leak into the wheels' environment, and nothing here talks to other machines.
@@ -60,7 +63,7 @@ test-core: $(CORE) ## all other tests, in an environment without ROS
 
 test-faults: $(DEV) ## inject every fault into node and tool; the table of reactions in output/faults.md
 	@mkdir -p output && rm -f output/faults.md
-	.venv/bin/python -m pytest tests/faults tests/ros/test_node_faults.py --all-faults --fault-table output/faults.md
+	.venv/bin/python -m pytest tests/faults $(NODE_FAULTS) --all-faults --fault-table output/faults.md
 
 fuzz: $(DEV) ## fuzz everything that reads foreign bytes (SECONDS=60 for each target); findings in fuzz/findings
 	.venv/bin/pip install -qq --only-binary :all: atheris==3.0.0

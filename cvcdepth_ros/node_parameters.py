@@ -29,6 +29,8 @@ class NodeParameters(OutputSettings, MissingCameraSettings, MatchingSettings, Mo
     """Configure and activate at start; switch off where a lifecycle manager does that."""
     max_age: float = Field(0.5, ge=0, le=3600)
     """Seconds (ROS time) after which a waiting set is not worth inference any more; 0 takes any age."""
+    max_image_mb: float = Field(64.0, gt=0, le=2000)
+    """Megabytes above which an image message is refused; queue_size such images are kept per camera at most."""
     reliable: bool = False
     """Subscribe images and camera_info reliably instead of with sensor-data QoS."""
     stale_after: float = Field(1.0, gt=0, le=3600)

@@ -52,6 +52,7 @@ class SurroundSession:
         self._watches = {name: CameraWatch(parameters.stale_after, parameters.frozen_after) for name in layout.names}
         self._overlaps: OverlapMonitor | None = None
         self._monitored_rig: Rig | None = None
+        self._max_image_mb = parameters.max_image_mb
         self._is_finished = False
         with ExitStack() as opened:
             trace = TraceFile(Path(parameters.trace).expanduser()) if parameters.trace else None
@@ -146,6 +147,10 @@ class SurroundSession:
 
     def _on_image(self, camera: str, message: Any) -> None:
         self.latencies.record("receive (ROS time)", (self._ros_time() - stamp_ns(message)) / 1e9)
+        megabytes = len(message.data) / 1e6
+        if megabytes > self._max_image_mb:
+            self._watches[camera].used(f"image of {megabytes:.1f} MB, more than max_image_mb ({self._max_image_mb:g})")
+            return
         self._pipeline.add(camera, message)
 
     def _on_camera_info(self, camera: str, message: Any) -> None:

@@ -4,6 +4,8 @@
 from pathlib import Path
 from typing import NamedTuple
 
+NODE = "the node, over DDS"
+
 
 class Row(NamedTuple):
     """One fault."""

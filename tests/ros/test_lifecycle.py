@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("rclpy", reason="these tests need a ROS environment")
 
 from camera_scene import DEPTH, Cameras, rig_without_calibrations
-from faults.table import FaultTable
+from faults.table import NODE, FaultTable
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.srv import SetParameters
@@ -20,7 +20,6 @@ from rclpy.parameter import Parameter
 from ros_graph import NodeProcess, RosGraph
 from sensor_msgs.msg import Image
 
-NODE = "the node, over DDS"
 FRONT = DEPTH["front"]
 SMALL = {"untrained": True, "height": 64, "width": 96}
 SLOW = {"untrained": True, "height": 1152, "width": 2048}

@@ -11,7 +11,7 @@ pytest.importorskip("rclpy", reason="these tests need a ROS environment")
 
 from camera_faults import FAULTS, sending
 from camera_scene import DEPTH, Scene, running_scene, stamp_of
-from faults.table import FaultTable
+from faults.table import NODE, FaultTable
 from recordings import CAMERAS
 
 OTHERS = [name for name in CAMERAS if name != "left"]
@@ -51,7 +51,7 @@ def test_a_fault_of_one_camera_is_named_and_the_others_go_on_until_it_recovers(
     begin = time.monotonic()
     scene.recover()
     back = time.monotonic() - begin
-    fault_table.add(f"camera {fault_name}", "the node, over DDS", status.message, told, back)
+    fault_table.add(f"camera {fault_name}", NODE, status.message, told, back)
     for name, topic in DEPTH.items():
         stamps = [stamp_of(message) for message in scene.graph.received[topic]]
         assert set(stamps) <= scene.cameras.sent[name]
