@@ -111,9 +111,9 @@ def test_a_hundred_transitions_in_any_order_leave_nothing_behind(graph: RosGraph
             cameras.run_until(lambda: graph.received[FRONT], "depth while active")
         if state == State.PRIMARY_STATE_UNCONFIGURED and name == "cleanup":
             kept.append(manager.process.resources())
-    # At first libraries load what they need but once.
+    # At first libraries load what they need but once; a single network that was kept would be more than 60 MiB.
     early, last = kept[len(kept) // 3], kept[-1]
-    assert last.resident_mib < 1.1 * early.resident_mib, kept
+    assert last.resident_mib < early.resident_mib + 100, kept
     assert (last.files, last.threads) == (early.files, early.threads), kept
 
 
