@@ -114,7 +114,8 @@ def test_a_hundred_transitions_in_any_order_leave_nothing_behind(graph: RosGraph
     # At first libraries load what they need but once; a single network that was kept would be more than 60 MiB.
     early, last = kept[len(kept) // 3], kept[-1]
     assert last.resident_mib < early.resident_mib + 100, kept
-    assert (last.files, last.threads) == (early.files, early.threads), kept
+    assert last.files <= early.files, kept
+    assert last.threads <= early.threads, kept
 
 
 def test_what_cannot_be_configured_leaves_nothing_of_itself(graph: RosGraph, rig: Path, tmp_path: Path):
