@@ -135,6 +135,7 @@ class SurroundDepthNode(ManagedNode):
     def _built_estimator(self, parameters: NodeParameters) -> DepthEstimator:
         self.get_logger().info(f"building the network for {parameters.device} with backend {parameters.backend}")
         estimator = self.wait_for(parameters.build_estimator)
+        return_memory()
         self.get_logger().info(f"model: {estimator.model_id} on {estimator.device}")
         if parameters.notice:
             self.get_logger().warning(parameters.notice)
