@@ -156,7 +156,7 @@ def test_what_cannot_be_activated_says_why_and_leaves_nothing_of_itself(
     after = manager.process.resources()
     assert after.files == before.files
     assert after.threads <= before.threads
-    assert FRONT not in dict(graph.node.get_topic_names_and_types())
+    graph.spin_until(lambda: FRONT not in dict(graph.node.get_topic_names_and_types()), "the topics to be gone")
 
 
 def test_after_a_failed_activation_a_mended_parameter_is_enough(graph: RosGraph, rig: Path):
