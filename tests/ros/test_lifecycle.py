@@ -151,7 +151,7 @@ def test_what_cannot_be_activated_says_why_and_leaves_nothing_of_itself(
     before = manager.process.resources()
     for _ in range(3):
         assert not manager.change("activate")
-        assert manager.state() == State.PRIMARY_STATE_INACTIVE
+        assert manager.state() == State.PRIMARY_STATE_INACTIVE, graph.log()
     graph.await_status("node", reason)
     after = manager.process.resources()
     assert after.files == before.files
