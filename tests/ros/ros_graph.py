@@ -18,7 +18,7 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,9 +26,14 @@ from typing import Any, NamedTuple
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from domains import own_domain
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParameters
+from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 NODE_MODULE = "cvcdepth_ros.surround_depth_node"
@@ -123,6 +128,7 @@ class RosGraph:
         self.received: dict[str, list[Any]] = defaultdict(list)
         self.statuses: dict[str, Any] = {}
         self._processes: list[tuple[NodeProcess, Path]] = []
+        self._clients: dict[str, Client] = {}
         self._folder = Path(self._resources.enter_context(tempfile.TemporaryDirectory()))
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
 
@@ -178,9 +184,29 @@ class RosGraph:
         status = self.statuses.get(f"surround_depth: {subject}")
         return {pair.key: pair.value for pair in status.values} if status else {}
 
+    def call(self, service_class: type, name: str, request: Any) -> Any:
+        """Return the service's response."""
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(service_class, name)
+        assert self._clients[name].wait_for_service(20), name
+        future = self._clients[name].call_async(request)
+        self.spin_until(future.done, f"an answer of {name}")
+        return future.result()
+
+    def set_parameters(self, **parameters: Any) -> list[SetParametersResult]:
+        """Set parameters of the node; return its answers."""
+        messages = [Parameter(name, value=value).to_parameter_msg() for name, value in parameters.items()]
+        request = SetParameters.Request(parameters=messages)
+        return list(self.call(SetParameters, "/surround_depth/set_parameters", request).results)
+
     def await_subscribers(self, topics: Sequence[str]) -> None:
         """Wait until each topic has a subscriber."""
         self.spin_until(lambda: all(self.node.count_subscribers(topic) for topic in topics), f"subscribers of {topics}")
+
+    def await_matches(self, publishers: Iterable[Publisher]) -> None:
+        """Wait until each publisher has a subscription that gets what it publishes from now on."""
+        waiting = list(publishers)
+        self.spin_until(lambda: all(publisher.get_subscription_count() for publisher in waiting), "all subscriptions")
 
     def close(self) -> None:
         for process, _ in self._processes:

@@ -2,8 +2,10 @@
 """`bag_replay bench` over real DDS, at the smallest size that means anything."""
 
 import json
+from collections.abc import Iterator
 
 import pytest
+from domains import own_domain
 from recordings import SAMPLE
 
 from cvcdepth_ros.bag_replay import main
@@ -11,6 +13,13 @@ from cvcdepth_ros.bag_replay import main
 pytest.importorskip("rclpy", reason="these tests need a ROS environment")
 
 SMALL = ("--untrained", "--height", "64", "--width", "96", "--seconds", "4", "--rate", "0.5")
+
+
+@pytest.fixture(autouse=True)
+def domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    with own_domain() as domain:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+        yield
 
 
 def test_one_line_compares_the_node_with_the_straightforward_one(capsys: pytest.CaptureFixture[str]):

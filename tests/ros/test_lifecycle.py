@@ -15,8 +15,6 @@ from camera_scene import DEPTH, Cameras, rig_without_calibrations
 from faults.table import NODE, FaultTable
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
-from rcl_interfaces.srv import SetParameters
-from rclpy.parameter import Parameter
 from ros_graph import NodeProcess, RosGraph
 from sensor_msgs.msg import Image
 
@@ -38,30 +36,20 @@ class Manager:
 
     def __init__(self, graph: RosGraph, process: NodeProcess) -> None:
         self._graph, self.process = graph, process
-        self._change = graph.node.create_client(ChangeState, "/surround_depth/change_state")
-        self._state = graph.node.create_client(GetState, "/surround_depth/get_state")
-        self._set = graph.node.create_client(SetParameters, "/surround_depth/set_parameters")
-        for client in (self._change, self._state, self._set):
-            assert client.wait_for_service(20)
 
     def change(self, name: str) -> bool:
         return self.change_by_id(TRANSITIONS[name][0])
 
     def change_by_id(self, number: int) -> bool:
-        future = self._change.call_async(ChangeState.Request(transition=Transition(id=number)))
-        self._graph.spin_until(future.done, f"the answer to transition {number}")
-        return bool(future.result().success)
+        request = ChangeState.Request(transition=Transition(id=number))
+        return bool(self._graph.call(ChangeState, "/surround_depth/change_state", request).success)
 
     def state(self) -> int:
-        future = self._state.call_async(GetState.Request())
-        self._graph.spin_until(future.done, "the state")
-        return int(future.result().current_state.id)
+        return int(self._graph.call(GetState, "/surround_depth/get_state", GetState.Request()).current_state.id)
 
     def set(self, **parameters: object) -> None:
-        messages = [Parameter(name, value=value).to_parameter_msg() for name, value in parameters.items()]
-        future = self._set.call_async(SetParameters.Request(parameters=messages))
-        self._graph.spin_until(future.done, "the parameters")
-        assert all(result.successful for result in future.result().results), future.result()
+        results = self._graph.set_parameters(**parameters)
+        assert all(result.successful for result in results), results
 
 
 @pytest.fixture

@@ -54,7 +54,7 @@ def live_depth(graph: RosGraph, rig: Path) -> dict[str, Depths]:
     publishers = {e.topic: graph.node.create_publisher(CLASSES[e.type], e.topic, reliable()) for e in entries}
     graph.subscribe(Image, *DEPTH.values())
     graph.start_node(rig=rig, untrained=True, max_age=0.0, **SIZE)
-    graph.await_subscribers([e.topic for e in entries if "CompressedImage" in e.type])
+    graph.await_matches(publishers.values())
     graph.spin_until(lambda: all(graph.node.count_publishers(topic) for topic in DEPTH.values()), "the node's outputs")
     for entry in sorted(entries, key=lambda entry: "CameraInfo" not in entry.type):
         publishers[entry.topic].publish(deserialize_message(entry.cdr, CLASSES[entry.type]))

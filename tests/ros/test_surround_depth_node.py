@@ -17,8 +17,6 @@ pytest.importorskip("rclpy", reason="these tests need a ROS environment")
 
 from faults.table import NODE
 from geometry_msgs.msg import TransformStamped
-from rcl_interfaces.srv import SetParameters
-from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from recordings import CAMERAS, JAZZY, sample_entries
@@ -377,21 +375,12 @@ def test_what_cannot_start_is_one_line_and_a_diagnostic(parameters, reason, grap
     assert len([line for line in graph.log().splitlines() if "[ERROR]" in line]) == 1
 
 
-def set_parameter(graph: RosGraph, name: str, value: Any) -> Any:
-    client = graph.node.create_client(SetParameters, "/surround_depth/set_parameters")
-    assert client.wait_for_service(20)
-    request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
-    future = client.call_async(request)
-    graph.spin_until(future.done, "the answer")
-    return future.result().results[0]
-
-
 def test_parameters_say_what_they_refuse(graph, rig_content, tmp_path):
     graph.start_node(rig=write_rig(tmp_path, rig_content), **SMALL)
     graph.await_status("node", "active")
-    assert set_parameter(graph, "cloud_max_range", 25.0).successful
-    assert "clean the node up first" in set_parameter(graph, "tolerance", 0.2).reason
-    assert "out of range" in set_parameter(graph, "cloud_stride", 1000).reason
+    assert graph.set_parameters(cloud_max_range=25.0)[0].successful
+    assert "clean the node up first" in graph.set_parameters(tolerance=0.2)[0].reason
+    assert "out of range" in graph.set_parameters(cloud_stride=1000)[0].reason
 
 
 def small_checkpoint(path: Path, seed: int) -> str:
@@ -412,12 +401,12 @@ def test_another_checkpoint_is_loaded_while_running_and_a_bad_one_is_refused(gra
     graph.await_subscribers([f"/camera/{name}/image_raw/compressed" for name in CAMERAS])
     feed.publish_until(lambda: graph.received[topic], "depth of the first network")
 
-    refused = set_parameter(graph, "checkpoint", str(damaged))
+    (refused,) = graph.set_parameters(checkpoint=str(damaged))
     assert not refused.successful
     assert "is damaged or not a safetensors file" in refused.reason
     assert "1.safetensors" in graph.await_status("model", "safetensors").message
 
-    assert set_parameter(graph, "checkpoint", second).successful
+    assert graph.set_parameters(checkpoint=second)[0].successful
     graph.await_status("model", "2.safetensors")
     former = bytes(graph.received[topic][0].data)
     graph.received[topic].clear()
@@ -456,8 +445,7 @@ def test_full_size_raw_images_at_ten_hertz_are_not_lost(graph, messages, rig_con
     # depend on what else runs.
     graph.start_node(rig=write_rig(tmp_path, rig_content), reliable=True, frozen_after=0.0, **SMALL)
     graph.subscribe(Image, "/surround_depth/front/depth/image_rect")
-    all_publishers = list(itertools.chain.from_iterable(publishers.values()))
-    graph.spin_until(lambda: all(publisher.get_subscription_count() for publisher in all_publishers), "subscribers")
+    graph.await_matches(itertools.chain.from_iterable(publishers.values()))
     start = time.monotonic()
     for index in range(sets):
         for offset, name in enumerate(FIRING_ORDER):
