@@ -53,7 +53,8 @@ def live_depth(graph: RosGraph, rig: Path) -> dict[str, Depths]:
     entries = [entry for entry in recordings.sample_entries(2) if entry.type in CLASSES]
     publishers = {e.topic: graph.node.create_publisher(CLASSES[e.type], e.topic, reliable()) for e in entries}
     graph.subscribe(Image, *DEPTH.values())
-    graph.start_node(rig=rig, untrained=True, max_age=0.0, **SIZE)
+    # Each image is sent once: best effort loses it when the subscription does not know of the publisher yet.
+    graph.start_node(rig=rig, untrained=True, max_age=0.0, reliable=True, **SIZE)
     graph.await_matches(publishers.values())
     graph.spin_until(lambda: all(graph.node.count_publishers(topic) for topic in DEPTH.values()), "the node's outputs")
     for entry in sorted(entries, key=lambda entry: "CameraInfo" not in entry.type):
