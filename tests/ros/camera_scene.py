@@ -83,7 +83,7 @@ class Scene:
         graph.subscribe(PointCloud2, CLOUD)
         graph.subscribe(String, CONTENT)
         graph.subscribe(Image, *DEPTH.values())
-        options = {"max_age": 0.0, "min_cameras": 4, "max_image_mb": 2.0, "trace": self.trace}
+        options = {"max_age": 0.0, "min_cameras": 4, "max_image_mb": 1.5, "trace": self.trace}
         self.node = graph.start_node(rig=rig, untrained=True, height=64, width=96, **options)
         graph.await_subscribers([f"/camera/{name}/image_raw/compressed" for name in CAMERAS])
 
