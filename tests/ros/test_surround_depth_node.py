@@ -446,6 +446,14 @@ def test_full_size_raw_images_at_ten_hertz_are_not_lost(graph, messages, rig_con
     graph.start_node(rig=write_rig(tmp_path, rig_content), reliable=True, frozen_after=0.0, **SMALL)
     graph.subscribe(Image, "/surround_depth/front/depth/image_rect")
     graph.await_matches(itertools.chain.from_iterable(publishers.values()))
+
+    def calibrated() -> bool:
+        for name in CAMERAS:
+            publishers[name][0].publish(infos[name])
+        graph.spin(0.1)
+        return all(message_of(graph, f"camera {name}") == "waiting for images: no image yet" for name in CAMERAS)
+
+    graph.spin_until(calibrated, "every calibration")
     start = time.monotonic()
     for index in range(sets):
         for offset, name in enumerate(FIRING_ORDER):
