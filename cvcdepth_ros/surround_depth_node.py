@@ -116,6 +116,7 @@ class SurroundDepthNode(ManagedNode):
         layout = None if parameters.rig == AUTO else load_rig_layout(Path(parameters.rig).expanduser())
         self._estimator = self._built_estimator(parameters)
         self._settings, self._layout = parameters, layout
+        return_memory()
 
     def _activate(self) -> None:
         if self._layout is None:
@@ -135,7 +136,6 @@ class SurroundDepthNode(ManagedNode):
     def _built_estimator(self, parameters: NodeParameters) -> DepthEstimator:
         self.get_logger().info(f"building the network for {parameters.device} with backend {parameters.backend}")
         estimator = self.wait_for(parameters.build_estimator)
-        return_memory()
         self.get_logger().info(f"model: {estimator.model_id} on {estimator.device}")
         if parameters.notice:
             self.get_logger().warning(parameters.notice)
