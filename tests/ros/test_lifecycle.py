@@ -4,7 +4,6 @@
 import random
 import signal
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -50,13 +49,6 @@ class Manager:
     def set(self, **parameters: object) -> None:
         results = self._graph.set_parameters(**parameters)
         assert all(result.successful for result in results), results
-
-
-@pytest.fixture
-def graph() -> Iterator[RosGraph]:
-    graph = RosGraph()
-    yield graph
-    graph.close()
 
 
 @pytest.fixture

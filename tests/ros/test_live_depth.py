@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The live node's depth is what `bag_replay run` computes of the same images."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +23,6 @@ SIZE = {"height": 64, "width": 96}
 CLASSES = {"sensor_msgs/msg/CompressedImage": CompressedImage, "sensor_msgs/msg/CameraInfo": CameraInfo}
 DEPTH = {name: f"/surround_depth/{name}/depth/image_rect" for name in CAMERAS}
 Depths = dict[tuple[int, int], NDArray[np.float32]]
-
-
-@pytest.fixture
-def graph() -> Iterator[RosGraph]:
-    graph = RosGraph()
-    yield graph
-    graph.close()
 
 
 def by_stamp(images: list[Any]) -> Depths:

@@ -4,7 +4,6 @@
 import copy
 import itertools
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -30,13 +29,6 @@ from cvcdepth_core.networks import DepthNet
 SMALL = {"untrained": True, "height": 96, "width": 160, "max_age": 0.0}
 FIRING_ORDER = ("back", "left", "front_left", "front", "front_right", "right")
 ROOT = Path(__file__).parents[2]
-
-
-@pytest.fixture
-def graph() -> Iterator[RosGraph]:
-    graph = RosGraph()
-    yield graph
-    graph.close()
 
 
 @pytest.fixture(scope="module")
