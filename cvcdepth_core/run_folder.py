@@ -6,7 +6,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +86,8 @@ class RunIdentity:
     """Of one epoch, of all processes together."""
     samples_together: int
     """Samples that go through the networks of all processes together."""
+    inputs: Mapping[str, str] = field(default_factory=dict)
+    """What it is made from, by what each is called: the start, and what `samples` alone does not tell of the data."""
 
     def to_state(self) -> dict[str, Any]:
         """Return what `refuse_other` compares, for the run's state."""
@@ -93,6 +95,7 @@ class RunIdentity:
             "config": self.config.model_dump_json(),
             "samples": self.samples,
             "samples_together": self.samples_together,
+            "inputs": json.dumps(dict(self.inputs)),
         }
 
     def refuse_other(self, state: Mapping[str, Any], path: Path) -> None:
@@ -114,6 +117,17 @@ class RunIdentity:
             raise CheckpointError(
                 f"{path}: was made from {state['samples']} samples, now there are {self.samples}; choose another folder"
             )
+        self._refuse_other_inputs(json.loads(state.get("inputs", "{}")), path)
+
+    def _refuse_other_inputs(self, were: Mapping[str, str], path: Path) -> None:
+        differences = [
+            f"{name} was {were.get(name, 'none')}, now it is {self.inputs.get(name, 'none')}"
+            for name in {**were, **self.inputs}
+            if were.get(name) != self.inputs.get(name)
+        ]
+        if differences:
+            told = "; ".join(differences)
+            raise CheckpointError(f"{path}: was made from something else: {told}; choose another folder")
 
 
 def _configuration(path: Path, state: Mapping[str, Any]) -> TrainingConfig:

@@ -113,9 +113,11 @@ class Trainer:
         metadata: Mapping[str, str] | None = None,
         observers: Sequence[RunObserver] = (),
         processes: Processes = ALONE,
+        inputs: Mapping[str, str] | None = None,
     ) -> None:
         """`metadata` travels in the checkpoints. Of several `processes`, the first alone validates, writes and tells.
 
+        `inputs` name what the run is made from beside its configuration; it is resumed with the same only.
         Raises CheckpointError when the folder holds another run, ConfigError when the processes cannot share a step,
         TrainingError when they have not found the same samples.
         """
@@ -132,6 +134,7 @@ class Trainer:
         self._validate = validate
         self._observers = tuple(observers) if processes.is_first else ()
         self._metadata = dict(metadata or {})
+        self._inputs: dict[str, str] = json.loads(processes.told_by_first(json.dumps(dict(inputs or {})).encode()))
         self._folder = RunFolder(run_directory)
         self._optimizer = torch.optim.AdamW(
             self.model.parameters(),
@@ -200,7 +203,7 @@ class Trainer:
 
     @property
     def _identity(self) -> RunIdentity:
-        return RunIdentity(self.config, self._batches.samples, self._samples_together)
+        return RunIdentity(self.config, self._batches.samples, self._samples_together, self._inputs)
 
     @property
     def _samples_together(self) -> int:

@@ -275,6 +275,25 @@ def test_a_run_goes_on_from_the_weights_that_it_began_with_only(better, worse, c
     assert "max_depth is 80.0, but the configuration's depth.max_depth is 200.0" in capsys.readouterr().err
 
 
+def test_a_run_goes_on_with_the_same_masks_only(better, capsys):
+    assert finetune(better.config, better.folder, "--no-masks") == 1
+    assert "state.pt: was made from something else: the masks of recording 1 was back " in capsys.readouterr().err
+
+
+def test_a_run_that_holds_nothing_out_goes_on_with_the_same_recordings_and_start_only(config, better, tmp_path, capsys):
+    path = config(optimizer={"epochs": 1, "samples_per_step": 5}, recordings={"held_out": 0, "min_travel": 0.1})
+    short = recordings.write_rosbag2(tmp_path / "short", recordings.sample_entries(4))
+    assert finetune(path, tmp_path / "run", *CHEAP, bags=(SAMPLE, short)) == NOT_PROMOTED
+    capsys.readouterr()
+    assert finetune(path, tmp_path / "run", *CHEAP, bags=(short, SAMPLE)) == 1
+    error = capsys.readouterr().err
+    assert "recording 1 was pandaset_002_excerpt (" in error
+    assert "recording 2 was short (" in error
+    start = better.folder / "candidate.safetensors"
+    assert finetune(path, tmp_path / "run", "--from", start, *CHEAP, bags=(SAMPLE, short)) == 1
+    assert "the start was random weights, now it is candidate.safetensors sha256:" in capsys.readouterr().err
+
+
 def test_an_interrupted_run_keeps_its_last_checkpoint_and_says_how_to_go_on(config, tmp_path):
     path = config(optimizer={"epochs": 500, "samples_per_step": 5}, checkpoint_every=1, validate_every=400)
     program = [sys.executable, "-m", "cvcdepth_ros.bag_replay", *command(path, tmp_path / "run", *CHEAP)]

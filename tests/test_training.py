@@ -135,6 +135,20 @@ def test_a_folder_of_another_run_is_refused_by_what_differs(uninterrupted):
         trainer(uninterrupted, fewer)
 
 
+def test_a_folder_of_a_run_that_was_made_from_something_else_is_refused_by_what_it_is(tmp_path):
+    settings = config(epochs=1)
+
+    def made_from(**inputs: str) -> Trainer:
+        return Trainer(settings, build_surround_model(settings), RandomBatches(), tmp_path, inputs=inputs)
+
+    made_from(start="a", rig="b").save()
+    made_from(rig="b", start="a")
+    with pytest.raises(CheckpointError, match=r"state.pt: was made from something else: start was a, now it is c; "):
+        made_from(start="c", rig="b")
+    with pytest.raises(CheckpointError, match="rig was b, now it is none; mask was none, now it is d"):
+        made_from(start="a", mask="d")
+
+
 def test_the_average_of_the_weights_is_what_is_saved_and_validated(tmp_path):
     settings = config(epochs=1)
     seen = []

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from cvcdepth_core.training import RunObserver, Trainer
 from cvcdepth_core.training_config import TrainingConfig
 from cvcdepth_ros.evaluation.result import EvaluationResult
 from cvcdepth_ros.finetuning.held_out import HeldOutPart, evaluate, held_out_parts, some_sets
+from cvcdepth_ros.finetuning.inputs import inputs_of
 from cvcdepth_ros.finetuning.judgement import Verdict, judge
 from cvcdepth_ros.finetuning.monitoring import TensorBoardObserver, has_tensorboard
 from cvcdepth_ros.finetuning.preparation import Prepared, Source, prepare
@@ -87,9 +88,11 @@ def fine_tune(order: Order, processes: Processes, tell: Tell) -> FineTuned | Non
     model = build_surround_model(order.config, order.start)
     device = own_device(resolve_device(order.device))
     parts = held_out_parts(prepared.indexes, order.config, str(device)) if processes.is_first else []
-    before = _scores_of_start(order, model, parts) if parts else None
+    if parts:
+        _keep_start(order, model)  # before the trainer fills the model with what a former call reached
     observers = [TensorBoardObserver(order.run)] if processes.is_first and has_tensorboard() else []
-    trainer = _trainer(order, model, batches, parts, processes, observers)
+    trainer = _trainer(order, model, batches, parts, processes, observers, inputs_of(prepared, order.started_from))
+    before = _scored(order, parts, order.run / START_FILE, "before") if parts else None
     try:
         trainer.train(quiet=order.quiet)
     finally:
@@ -109,6 +112,7 @@ def _trainer(
     parts: list[HeldOutPart],
     processes: Processes,
     observers: list[TensorBoardObserver],
+    inputs: Mapping[str, str],
 ) -> Trainer:
     config = order.config
     watching: list[RunObserver] = [*observers]
@@ -125,6 +129,7 @@ def _trainer(
         _metadata(order),
         watching,
         processes,
+        inputs,
     )
 
 
@@ -133,8 +138,8 @@ def _metadata(order: Order) -> dict[str, str]:
     return {"version": package_version(), "config": config, _START_KEY: order.started_from}
 
 
-def _scores_of_start(order: Order, model: SurroundModel, parts: list[HeldOutPart]) -> EvaluationResult:
-    """Score what the run starts from; CheckpointError when the run in this folder started from other weights."""
+def _keep_start(order: Order, model: SurroundModel) -> None:
+    """Write what the run starts from; CheckpointError when the run in this folder started from other weights."""
     path = order.run / START_FILE
     if not path.exists():
         states = (model.depth_net.state_dict(), model.pose_net.state_dict())
@@ -142,7 +147,6 @@ def _scores_of_start(order: Order, model: SurroundModel, parts: list[HeldOutPart
     found = load_checkpoint(path).metadata.get(_START_KEY)
     if found != order.started_from:
         raise CheckpointError(f"{order.run}: its run started from {found}, now it is {order.started_from}")
-    return _scored(order, parts, path, "before")
 
 
 def _scored(order: Order, parts: list[HeldOutPart], weights: Path, when: str) -> EvaluationResult:
