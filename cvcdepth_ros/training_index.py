@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import zipfile
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ from cvcdepth_ros.replay import RecordedImage, SurroundReplay
 from cvcdepth_ros.settings import MatchingSettings
 from cvcdepth_ros.synchronizer import SurroundSet
 
-_FORMAT = 1
+_FORMAT = 2
 _THUMBNAIL = (40, 24)
 
 
@@ -48,6 +49,14 @@ class RecordingIndex:
     """[S, h, w] small grey pictures of the anchor camera, to see motion by where none is recorded."""
     unplaced: int = 0
     """Sets left out since the recorded motion does not reach them."""
+    unread: tuple[str, ...] = ()
+    """What of the recording could not be read, in words."""
+
+    @property
+    def losses(self) -> list[str]:
+        """What of the recording is not there to learn from, in words."""
+        outside = [f"{self.unplaced} sets lie outside of the recorded motion"] if self.unplaced else []
+        return [*self.unread, *outside]
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -85,6 +94,7 @@ def build_index(path: Location, matching: MatchingSettings, rig_layout: RigLayou
         sets, thumbnails = _collect(recording, replay, motion)
         if not sets:
             raise RecordingError(f"{path}: no surround set: {replay.why_no_set()}")
+        unread = tuple(_unread(recording, replay, len(sets)))
     poses = None if motion is None else [_poses(motion, surround_set) for surround_set in sets]
     placed = [i for i in range(len(sets)) if poses is None or poses[i] is not None]
     if not placed:
@@ -97,7 +107,18 @@ def build_index(path: Location, matching: MatchingSettings, rig_layout: RigLayou
         poses=None if poses is None else np.array([poses[i] for i in placed]).reshape(-1, len(layout.names), 4, 4),
         thumbnails=np.stack(thumbnails) if motion is None else None,
         unplaced=len(sets) - len(placed),
+        unread=unread,
     )
+
+
+def _unread(recording: Recording, replay: SurroundReplay, sets: int) -> Iterator[str]:
+    """Say what of a recording that was read to its end, and gave so many sets, could not be read."""
+    if recording.damage:
+        yield f"not everything could be read: {recording.damage}"
+    if replay.unreadable.count:
+        yield f"{replay.unreadable.count} images could not be read, the first: {replay.unreadable.reasons[0]}"
+    if undecodable := replay.statistics.sets - sets:
+        yield f"{undecodable} sets are left out: no picture of camera {replay.layout.anchor_camera} could be decoded"
 
 
 def _complete_layout(recording: Recording, layout: RigLayout | None) -> RigLayout:
@@ -190,6 +211,7 @@ def _write(cached: Path, index: RecordingIndex, key: str) -> None:
         key=np.array(key),
         layout=np.array(index.layout.model_dump_json()),
         unplaced=np.array(index.unplaced),
+        unread=np.array(json.dumps(index.unread)),
         **{name: array for name, array in arrays.items() if array is not None},
     )
 
@@ -208,6 +230,7 @@ def _read(cached: Path, path: Location, key: str) -> RecordingIndex | None:
                 kept.get("poses"),
                 kept.get("thumbnails"),
                 int(kept["unplaced"]),
+                tuple(json.loads(str(kept["unread"]))),
             )
     except (OSError, ValueError, KeyError, zipfile.BadZipFile):
         return None

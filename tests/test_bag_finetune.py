@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import recordings
 import yaml
-from recordings import SAMPLE
+from recordings import JAZZY, SAMPLE
 
 from cvcdepth_core.checkpoint import load_checkpoint
 from cvcdepth_core.training_config import load_training_config
@@ -381,6 +381,26 @@ def test_a_recording_that_cannot_be_used_is_left_out_by_name_beside_one_that_can
     assert "warning: left out: " in caught
     assert "lame: check 1, cameras" in caught
     assert "nothing was proven: no recording has a held-out part" in caught
+
+
+def test_what_a_recording_lost_is_told_and_not_counted_as_held_out(config, tmp_path, capsys):
+    entries = recordings.sample_entries()
+    left = [i for i, entry in enumerate(entries) if entry.topic == "/camera/left/image_raw/compressed"]
+    for i in left[7:]:
+        content = JAZZY.deserialize_cdr(entries[i].cdr, entries[i].type)
+        content.data = content.data[:1000]
+        entries[i] = entries[i]._replace(cdr=bytes(JAZZY.serialize_cdr(content, entries[i].type)))
+    blind = recordings.write_rosbag2(tmp_path / "blind", entries)
+    (blind / "blind_1.mcap").write_bytes(b"")
+    one_step = config(optimizer={"epochs": 1, "samples_per_step": 9})
+    skipped = ("--skip", "brightness", *CHEAP)
+    assert finetune(one_step, tmp_path / "run", *skipped, bags=(SAMPLE, blind)) in (PROMOTED, NOT_PROMOTED)
+    lost = f"{blind}: not everything could be read: {blind}: metadata.yaml does not list blind_1.mcap, not read"
+    assert f"warning: {lost}" in capsys.readouterr().err
+    result = json.loads((tmp_path / "run" / "finetune.json").read_text())
+    assert lost in result["warnings"]
+    assert f"; not scored: {blind}: no set: 3 refused, the first: set at " in result["verdict"]["reason"]
+    assert [entry["held_out_sets"] for entry in result["recordings"]] == [3, 0]
 
 
 def test_a_configuration_for_another_dataset_is_refused(config, tmp_path, capsys):

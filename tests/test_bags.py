@@ -238,6 +238,14 @@ def test_a_missing_file_of_a_split_recording_is_reported(tmp_path: Path):
         assert list(recording.messages())
 
 
+def test_a_file_of_the_folder_that_the_metadata_does_not_list_is_reported(tmp_path: Path):
+    path = Path(shutil.copytree(SAMPLE, tmp_path / "bag"))
+    shutil.copy(SAMPLE_MCAP, path / "bag_1.mcap")
+    recordings.zstd_file(SAMPLE_MCAP, path / f"{SAMPLE_MCAP.name}.zstd")
+    with open_recording(path) as recording:
+        assert recording.damage == f"{path}: metadata.yaml does not list bag_1.mcap, not read"
+
+
 def test_an_unreadable_metadata_file_is_reported_and_not_needed(tmp_path: Path):
     path = Path(shutil.copytree(SAMPLE, tmp_path / "bag"))
     (path / "metadata.yaml").write_bytes(b"")

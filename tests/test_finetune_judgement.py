@@ -2,6 +2,7 @@
 """The gate: which of two evaluations of the same sets is better, judged on the shipped recording and simple depths."""
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import pytest
@@ -9,7 +10,7 @@ from recordings import CAMERAS, SAMPLE
 
 from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings
 from cvcdepth_ros.evaluation.recording import evaluate_recording
-from cvcdepth_ros.evaluation.result import EvaluationResult
+from cvcdepth_ros.evaluation.result import EvaluationResult, Failure
 from cvcdepth_ros.finetuning.judgement import camera_numbers, judge, numbers_of, score_of
 
 
@@ -40,6 +41,13 @@ def test_depth_by_which_nothing_is_seen_elsewhere_explains_nothing():
     assert score_of(lost) > 0.5 > score_of(constant(2.0, with_lidar=False))
     assert not judge(constant(10.0, with_lidar=False), lost).promoted
     assert judge(lost, constant(10.0, with_lidar=False)).promoted
+
+
+def test_a_verdict_names_the_recordings_that_were_not_scored():
+    near, far = constant(2.0), constant(10.0)
+    lost = replace(far, failed=[Failure("other", "other.mcap", "other.mcap: no set: 3 refused")])
+    assert judge(near, lost).reason.endswith(" held-out sets); not scored: other.mcap: no set: 3 refused")
+    assert "not scored" not in judge(near, far).reason
 
 
 def test_the_numbers_of_cameras_and_of_all_belong_together():

@@ -9,7 +9,7 @@ from itertools import chain
 import numpy as np
 import pytest
 import torch
-from recordings import JAZZY, SAMPLE, Entry, changed, sample_entries, write_rosbag2
+from recordings import JAZZY, SAMPLE, Entry, changed, cut, sample_entries, write_rosbag2
 
 from cvcdepth_core.checkpoint import DepthModelSpec
 from cvcdepth_core.distributed import Processes
@@ -288,6 +288,23 @@ def test_sets_that_the_recorded_motion_does_not_reach_are_left_out(tmp_path):
     recording = build_index(write_rosbag2(tmp_path / "short", short), MATCHING)
     assert len(recording) + recording.unplaced == 10
     assert recording.unplaced >= 3
+    assert recording.losses == [f"{recording.unplaced} sets lie outside of the recorded motion"]
+
+
+def test_an_index_tells_what_of_the_recording_was_not_there_to_learn_from(index, tmp_path):
+    assert index.losses == []
+    topic = "/camera/front/image_raw/compressed"
+    entries = without(sample_entries(), "/odom", "/tf")
+    front = [i for i, entry in enumerate(entries) if entry.topic == topic]
+    entries[front[4]] = next(iter(changed([entries[front[4]]], topic, lambda m: setattr(m, "data", m.data[:1000]))))
+    entries[front[7]] = entries[front[7]]._replace(cdr=entries[front[7]].cdr[:20])
+    whole = write_rosbag2(tmp_path / "whole", entries) / "whole.mcap"
+    recording = cut(whole, tmp_path / "cut.mcap", 0.95)
+    for found in (build_index(recording, MATCHING), *(load_index(recording, tmp_path, MATCHING) for _ in range(2))):
+        damage, unreadable, undecodable = found.losses
+        assert damage.startswith(f"not everything could be read: {recording}: ")
+        assert unreadable.startswith(f"1 images could not be read, the first: camera front: {recording}: {topic} at ")
+        assert undecodable == "1 sets are left out: no picture of camera front could be decoded"
 
 
 def test_motion_that_reaches_no_set_is_refused_by_the_recordings_name(tmp_path):

@@ -27,6 +27,7 @@ _LOCAL_READERS: dict[bytes, Callable[[Path], RecordingFile]] = {
     ros1_file.MAGIC: Ros1File,
 }
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+_ZSTD_SUFFIX = ".zstd"
 _FOREVER = 2**63 - 1
 # Raw images of a dark garage shrink to a hundredth; what shrinks to less is no recording.
 _MAX_EXPANSION = 500
@@ -176,6 +177,8 @@ class Recording:
             return [path]
         present = sorted(file for file in path.iterdir() if file.name.endswith(STORAGE_SUFFIXES))
         files = self._listed_by_metadata(path) or present
+        if unlisted := _unlisted(present, files):
+            self._damage.append(f"{path}: metadata.yaml does not list {', '.join(unlisted)}, not read")
         if missing := [file.name for file in files if not file.exists()]:
             self._damage.append(f"{path}: metadata.yaml lists {', '.join(missing)}, not found")
         if not (files := [file for file in files if file.exists()]):
@@ -237,6 +240,13 @@ class Recording:
         except zstandard.ZstdError as error:
             raise RecordingError(f"{path}: cannot be decompressed: {error}") from error
         return target
+
+
+def _unlisted(present: Sequence[Location], listed: Sequence[Location]) -> list[str]:
+    """Name the files beside those that are listed; not the unpacked one that `ros2 bag` leaves beside a packed one."""
+    known = {file.name.removesuffix(_ZSTD_SUFFIX) for file in listed}
+    names = [file.name for file in present if not file.name.startswith(".")]
+    return [name for name in names if name.removesuffix(_ZSTD_SUFFIX) not in known]
 
 
 def _copy(packed: IO[bytes], unpacked: IO[bytes], most: int) -> None:

@@ -97,9 +97,21 @@ def _recording(tuned: FineTuned, number: int) -> dict[str, Any]:
         "sets": len(index),
         "outside_of_recorded_motion": index.unplaced,
         "training_samples": tuned.samples[number],
-        "held_out_sets": sum(len(part.spans) for part in tuned.parts if part.job.path == str(index.path)),
+        "held_out_sets": _scored_sets(tuned, str(index.path)),
         "cameras": index.layout.names,
     }
+
+
+def _scored_sets(tuned: FineTuned, path: str) -> int:
+    """Count the held-out sets of a recording that both scores rest on: a part that failed proves nothing."""
+    if tuned.before is None or tuned.after is None:
+        return 0
+    names = {part.job.name for part in tuned.parts if part.job.path == path}
+    before, after = (
+        {stamp for table in result.scores.images if table.recording in names for stamp in table.stamps_ns.tolist()}
+        for result in (tuned.before, tuned.after)
+    )
+    return len(before & after)
 
 
 def _rigs(indexes: Sequence[RecordingIndex]) -> list[dict[str, Any]]:

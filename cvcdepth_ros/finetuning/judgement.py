@@ -66,7 +66,7 @@ def judge(before: EvaluationResult, after: EvaluationResult) -> Verdict:
     try:
         comparison = compare(before.scores, after.scores) if basis == "LiDAR" else _compare_label_free(before, after)
     except ConfigError as error:
-        return Verdict(False, f"nothing was proven: {error}")
+        return Verdict(False, f"nothing was proven: {error}{_not_scored(before, after)}")
     difference = comparison.differences[score]
     promoted = difference.high < 0  # False for NaN
     interval = f"{comparison.level:.0%} interval {difference.low:+.4f} to {difference.high:+.4f}"
@@ -76,7 +76,8 @@ def judge(before: EvaluationResult, after: EvaluationResult) -> Verdict:
     )
     words = "better than the start" if promoted else "not proven to be better than the start"
     by = "by the LiDAR" if basis == "LiDAR" else "without LiDAR, by how well the depth explains the pictures"
-    return Verdict(promoted, f"{words}, {by}: {numbers}", basis, score, difference, comparison)
+    reason = f"{words}, {by}: {numbers}{_not_scored(before, after)}"
+    return Verdict(promoted, reason, basis, score, difference, comparison)
 
 
 def score_of(result: EvaluationResult) -> float:
@@ -114,6 +115,12 @@ def photometric(image: ImageScore) -> float:
 def known(numbers: Mapping[str, float]) -> dict[str, float | None]:
     """Put None in the place of NaN, which JSON does not have."""
     return {name: None if math.isnan(number) else number for name, number in numbers.items()}
+
+
+def _not_scored(before: EvaluationResult, after: EvaluationResult) -> str:
+    """Name the recordings whose held-out part the verdict knows nothing of."""
+    reasons = {failure.path: failure.reason for result in (before, after) for failure in result.failed}
+    return "".join(f"; not scored: {reason}" for reason in reasons.values())
 
 
 def _camera_numbers(result: EvaluationResult, camera: str, metrics: Mapping[str, float]) -> dict[str, float]:

@@ -61,8 +61,10 @@ def prepare(source: Source, run: Path) -> Prepared:
         try:
             problems = [found for found in checked(path, source, run) if found.result.status in ("failed", "warning")]
             _refuse(path, problems)
-            prepared.indexes.append(load_index(path, run / _INDEX_FOLDER, source.matching, source.layout))
+            index = load_index(path, run / _INDEX_FOLDER, source.matching, source.layout)
+            prepared.indexes.append(index)
             prepared.warnings += [_told(path, problem) for problem in problems]
+            prepared.warnings += [f"{path}: {loss}" for loss in index.losses]
         except (CvcDepthError, OSError) as error:
             prepared.left_out[str(path)] = str(error)
     if not prepared.indexes:
