@@ -117,8 +117,6 @@ class EvaluationConfig(_Section):
 
     max_depth: float = Field(default=200.0, gt=0)
     """Metres; ground truth at or beyond it is left out, predictions are clamped to it."""
-    flip_fusion: bool = False
-    """Predict the mirrored image too and fuse both depths ("pp")."""
     sets: int = Field(default=20, ge=2)
     """Held-out sets, at most, that a validation during the run scores; at its start and end all are scored."""
     patience: int | None = Field(default=None, ge=1)

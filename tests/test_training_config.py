@@ -31,7 +31,7 @@ def test_shipped_files_hold_the_published_hyper_parameters():
         assert not loss.corrected
         assert (config.optimizer.learning_rate, config.optimizer.epochs, config.seed) == (1e-4, 20, 42)
     r34 = load_training_config(SHIPPED / "nuscenes_r34.yaml")
-    assert (r34.depth.encoder, r34.pose.encoder, r34.evaluation.flip_fusion) == ("resnet34", "resnet34", True)
+    assert (r34.depth.encoder, r34.pose.encoder) == ("resnet34", "resnet34")
     assert r34.objective == nuscenes.objective
 
 
@@ -94,6 +94,7 @@ def test_every_field_of_the_configuration_is_described():
         (DEPTH + "objective: {spatial: -1}", r"objective.spatial is -1.*greater than or equal to 0"),
         (DEPTH + "objective: {pose_consistency: 1}", r"pose_consistency is 1.0.*'front', expected 'per_camera'"),
         (DEPTH + "augmentation: {color_jitter: {hues: 1}}", r"color_jitter.hues is no known field.*brightness"),
+        (DEPTH + "evaluation: {flip_fusion: true}", r"evaluation.flip_fusion is no known field; expected one of"),
         (DEPTH.replace("64", "100"), r"depth.height is 100.*multiple of 32"),
         (DEPTH.replace("max_depth: 80", "max_depth: 0.5"), r"min_depth 1.0 must be below max_depth 0.5"),
         ("seed: 1", r"depth is missing"),
