@@ -115,7 +115,7 @@ class OptimizerConfig(_Section):
 class EvaluationConfig(_Section):
     """How predictions are scored."""
 
-    max_depth: float = Field(default=200.0, gt=0)
+    max_depth: float = Field(default=200.0, gt=0, le=1e4)
     """Metres; ground truth at or beyond it is left out, predictions are clamped to it."""
     sets: int = Field(default=20, ge=2)
     """Held-out sets, at most, that a validation during the run scores; at its start and end all are scored."""

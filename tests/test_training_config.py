@@ -95,6 +95,7 @@ def test_every_field_of_the_configuration_is_described():
         (DEPTH + "objective: {pose_consistency: 1}", r"pose_consistency is 1.0.*'front', expected 'per_camera'"),
         (DEPTH + "augmentation: {color_jitter: {hues: 1}}", r"color_jitter.hues is no known field.*brightness"),
         (DEPTH + "evaluation: {flip_fusion: true}", r"evaluation.flip_fusion is no known field; expected one of"),
+        (DEPTH + "evaluation: {max_depth: .inf}", r"evaluation.max_depth is inf.*less than or equal to 10000"),
         (DEPTH.replace("64", "100"), r"depth.height is 100.*multiple of 32"),
         (DEPTH.replace("max_depth: 80", "max_depth: 0.5"), r"min_depth 1.0 must be below max_depth 0.5"),
         ("seed: 1", r"depth is missing"),
