@@ -16,8 +16,11 @@ from cvcdepth_core.scores import ALL, Scaling, Scores
 SetValues = dict[tuple[str, int], NDArray[np.float64]]
 """The numbers [N, M] of N cameras by (recording, stamp) of the set; NaN where there is none."""
 
+SETS_TO_PROVE = 6
+"""Sets without which a difference is no proof. Where chance decides, n draws are all better or all worse in 2 / 2^n of
+the cases: 6 % of five draws, 3 % of six."""
+
 _LEAST_SETS = 2
-_BLOCKS_AT_LEAST = 4
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,8 @@ class Comparison:
     """By the names of what was compared: `METRIC_NAMES`."""
     sets: int
     """Surround sets that both results have."""
+    measured: int
+    """Those among them of which both have any number."""
     only_in_first: int
     only_in_second: int
     level: float
@@ -49,6 +54,11 @@ class Comparison:
     block: int
     """Consecutive sets that were drawn together."""
     seed: int
+
+    @property
+    def can_prove(self) -> bool:
+        """Whether there are enough sets for an interval to mean what its level says."""
+        return self.measured >= SETS_TO_PROVE
 
 
 def compare(
@@ -66,7 +76,7 @@ def compare(
 
     Sets are resampled with replacement, the same for both results. Consecutive sets look alike, so blocks of `block`
     consecutive ones (a second at 10 Hz) are drawn at once (circular block bootstrap, Politis and Romano 1992): single
-    sets would give intervals far too narrow. Blocks are shortened to a quarter of the sets where there are few.
+    sets would give intervals far too narrow. Blocks are shortened to a sixth of the sets where there are few.
     Raises ConfigError when the settings or the cameras differ, or fewer than two sets are common.
     """
     if first.settings != second.settings:
@@ -94,12 +104,13 @@ def compare_values(
     common = sorted(first.keys() & second.keys())
     if len(common) < _LEAST_SETS:
         raise ConfigError(f"comparison: {len(common)} sets in common, want {_LEAST_SETS} or more")
-    block = max(1, min(block, len(common) // _BLOCKS_AT_LEAST))
+    block = max(1, min(block, len(common) // SETS_TO_PROVE))
     paired = np.stack([np.stack([values[key] for key in common]) for values in (first, second)])
     counts = _resampled_counts(len(common), block, resamples, seed)
     return Comparison(
         differences=_differences(paired, counts, level, names),
         sets=len(common),
+        measured=int((~np.isnan(paired)).any(axis=(2, 3)).all(axis=0).sum()),
         only_in_first=len(first) - len(common),
         only_in_second=len(second) - len(common),
         level=level,

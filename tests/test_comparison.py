@@ -4,7 +4,7 @@ import math
 import numpy as np
 import pytest
 
-from cvcdepth_core.comparison import compare, rank_correlation
+from cvcdepth_core.comparison import compare, compare_values, rank_correlation
 from cvcdepth_core.errors import ConfigError
 from cvcdepth_core.metrics import METRIC_NAMES
 from cvcdepth_core.scores import ALL, DepthSamples, Scores, ScoreSettings, SurroundScorer
@@ -73,9 +73,21 @@ def test_only_common_sets_are_compared_and_the_others_are_counted():
 
 def test_blocks_are_shortened_where_sets_are_few():
     assert compare(predicted(0.2, sets=60), predicted(0.1, sets=60)).block == 10
-    few = compare(predicted(0.2, 0, sets=8), predicted(0.1, 1, sets=8))
+    few = compare(predicted(0.2, 0, sets=12), predicted(0.1, 1, sets=12))
     assert few.block == 2
     assert few.differences["abs_rel"].low < few.differences["abs_rel"].high
+
+
+def test_a_few_sets_prove_nothing_even_where_all_agree():
+    five, six = (compare(predicted(0.2, 0, sets=n), predicted(0.1, 1, sets=n)) for n in (5, 6))
+    assert five.differences["abs_rel"].high < 0
+    assert (five.can_prove, six.can_prove) == (False, True)
+
+
+def test_sets_without_truth_prove_nothing():
+    values = {("drive", stamp): np.array([[math.nan if stamp < 4 else 1.0], [math.nan]]) for stamp in range(9)}
+    found = compare_values(values, values, ["abs_rel"])
+    assert (found.sets, found.measured, found.can_prove) == (9, 5, False)
 
 
 def test_blocks_widen_the_interval_where_consecutive_sets_are_alike():

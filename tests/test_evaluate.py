@@ -506,6 +506,23 @@ def test_a_result_does_not_differ_from_itself(output: Path, capsys: pytest.Captu
     assert all(d["difference"] == d["low"] == d["high"] == 0 for one in differences.values() for d in one.values())
 
 
+def test_results_that_were_measured_differently_are_compared_with_a_warning(
+    two_sets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    folders = (tmp_path / "near", tmp_path / "far", tmp_path / "other")
+    for folder, options in zip(folders, ((), ("--constant-depth", "3"), ("--lidar-tolerance", "0.2")), strict=True):
+        score(folder, two_sets, *CONSTANT, *options)
+    near, far, other = (str(folder / "metrics.json") for folder in folders)
+    capsys.readouterr()
+    assert main(["evaluate", "--compare", near, far]) == 0
+    captured = capsys.readouterr()
+    assert captured.err == ""
+    assert "too few sets to say" in captured.out
+    assert " different" not in captured.out
+    assert main(["evaluate", "--compare", near, other]) == 0
+    assert "were measured differently (lidar_tolerance)" in capsys.readouterr().err
+
+
 def test_results_of_different_limits_are_not_compared(
     output: Path, two_sets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):

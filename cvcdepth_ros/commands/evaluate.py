@@ -196,6 +196,9 @@ def _comparison(first: Path, second: Path) -> tuple[dict[str, Any], str]:
     from cvcdepth_ros.evaluation.result import StoredResult, comparison_to_json
 
     content = comparison_to_json(StoredResult.read(first), StoredResult.read(second))
+    if content["measured_differently"]:
+        fields = ", ".join(content["measured_differently"])
+        warn(f"{first} and {second} were measured differently ({fields}): not only the models make them differ")
     return content, _comparison_text(content)
 
 
@@ -261,7 +264,10 @@ def _row(name: str, score: "Score", scaled: "Score", ratio: str) -> tuple[str, .
 def _comparison_text(content: dict[str, Any]) -> str:
     header = ("", "A", "B", "B - A", f"{content['level']:.0%} interval", "")
     rows = [
-        (f"{name}{' (median-scaled)' if scaling == 'median' else ''}", *_difference_cells(difference))
+        (
+            f"{name}{' (median-scaled)' if scaling == 'median' else ''}",
+            *_difference_cells(difference, content["can_prove"]),
+        )
         for scaling, differences in content["differences"].items()
         for name, difference in differences.items()
     ]
@@ -277,11 +283,12 @@ def _comparison_text(content: dict[str, Any]) -> str:
     )
 
 
-def _difference_cells(difference: dict[str, float | None]) -> tuple[str, ...]:
+def _difference_cells(difference: dict[str, float | None], can_prove: bool) -> tuple[str, ...]:
     first, second, change, low, high = (difference[name] for name in ("first", "second", "difference", "low", "high"))
     if first is None or second is None or change is None or low is None or high is None:
         return ("", "", "", "", "not known")
-    verdict = "the same within the interval" if low <= 0 <= high else "different"
+    outside = "different" if can_prove else "too few sets to say"
+    verdict = "the same within the interval" if low <= 0 <= high else outside
     return (f"{first:.4f}", f"{second:.4f}", f"{change:+.4f}", f"{low:+.4f} to {high:+.4f}", verdict)
 
 

@@ -22,6 +22,8 @@ from cvcdepth_ros.evaluation.job import Dependencies, EvaluationJob
 from cvcdepth_ros.evaluation.recording import RecordingScores
 
 SCHEMA = 2
+_DECIDE_WHAT_IS_MEASURED = ("rig", "base_frame", "tolerance", "lidar", "lidar_tolerance", "no_occlusion_filter")
+
 PROTOCOLS: tuple[ScoreProtocol, ...] = ("image", "pool")
 
 
@@ -134,6 +136,7 @@ class StoredResult:
 
     model_id: str
     scores: Scores
+    configuration: Mapping[str, Any]
 
     @classmethod
     def read(cls, path: Path) -> StoredResult:
@@ -141,11 +144,12 @@ class StoredResult:
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
             schema, model_id, rows = content["schema"], content["model"]["id"], content["rows"]
+            configuration = dict(content["configuration"])
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ConfigError(f"{path}: not a metrics.json of evaluate: {error!r}") from error
         if schema != SCHEMA:
             raise ConfigError(f"{path}: schema is {schema}, expected {SCHEMA}")
-        return cls(str(model_id), Scores.from_json(rows))
+        return cls(str(model_id), Scores.from_json(rows), configuration)
 
 
 def comparison_to_json(first: StoredResult, second: StoredResult) -> dict[str, Any]:
@@ -156,6 +160,10 @@ def comparison_to_json(first: StoredResult, second: StoredResult) -> dict[str, A
         "first": first.model_id,
         "second": second.model_id,
         **_without_differences(found["metric"]),
+        "can_prove": found["metric"].can_prove,
+        "measured_differently": [
+            name for name in _DECIDE_WHAT_IS_MEASURED if first.configuration.get(name) != second.configuration.get(name)
+        ],
         "differences": {scaling: _differences(comparison) for scaling, comparison in found.items()},
     }
 

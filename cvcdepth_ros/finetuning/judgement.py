@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from cvcdepth_core.comparison import Comparison, Difference, SetValues, compare, compare_values
+from cvcdepth_core.comparison import SETS_TO_PROVE, Comparison, Difference, SetValues, compare, compare_values
 from cvcdepth_core.errors import ConfigError
 from cvcdepth_core.scores import ALL, mean
 from cvcdepth_ros.evaluation.frames import ImageScore
@@ -68,13 +68,15 @@ def judge(before: EvaluationResult, after: EvaluationResult) -> Verdict:
     except ConfigError as error:
         return Verdict(False, f"nothing was proven: {error}{_not_scored(before, after)}")
     difference = comparison.differences[score]
-    promoted = difference.high < 0  # False for NaN
+    promoted = comparison.can_prove and difference.high < 0  # False for NaN
     interval = f"{comparison.level:.0%} interval {difference.low:+.4f} to {difference.high:+.4f}"
     numbers = (
         f"{_name(score)} {difference.first:.4f} before, {difference.second:.4f} after, difference "
         f"{difference.difference:+.4f} ({interval}, {comparison.sets} held-out sets)"
     )
     words = "better than the start" if promoted else "not proven to be better than the start"
+    if not comparison.can_prove:
+        words = f"{words}, too few held-out sets: {comparison.measured}, want {SETS_TO_PROVE}"
     by = "by the LiDAR" if basis == "LiDAR" else "without LiDAR, by how well the depth explains the pictures"
     reason = f"{words}, {by}: {numbers}{_not_scored(before, after)}"
     return Verdict(promoted, reason, basis, score, difference, comparison)
