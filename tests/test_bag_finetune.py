@@ -2,6 +2,7 @@
 """`finetune`: short runs on the shipped recording, what they leave behind, the gate, and what they refuse."""
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -151,6 +152,18 @@ def test_the_same_command_again_adds_nothing(better):
     assert finetune(better.config, better.folder) == PROMOTED
     assert {path.name: path.read_bytes() for path in better.folder.glob("*.safetensors")} == kept
     assert better.log == log
+
+
+def test_what_was_promoted_stays_when_the_run_goes_on_to_weights_that_are_not(better, tmp_path):
+    run = Run(shutil.copytree(better.folder, tmp_path / "run"), better.config, PROMOTED)
+    shutil.copy(run.folder / "start.safetensors", run.folder / "candidate.safetensors")
+    best = (run.folder / "best.safetensors").read_bytes()
+    assert finetune(run.config, run.folder) == PROMOTED
+    assert (run.folder / "best.safetensors").read_bytes() == best
+    assert run.card["weights"] == better.card["weights"]
+    assert run.card["scores"] == better.card["scores"]
+    reason = run.result["verdict"]["reason"]
+    assert "; these are weights of a former call, those of this one are not proven to be better than" in reason
 
 
 def test_weights_that_are_not_proven_better_are_not_promoted_and_the_exit_code_says_so(worse):

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -161,7 +161,6 @@ def _judged(
     run = order.run
     best, candidate = run / BEST_FILE, run / CANDIDATE_FILE
     if before is None:
-        best.unlink(missing_ok=True)
         reason = "nothing was proven: no recording has a held-out part (recordings.held_out)"
         return run / CHECKPOINT_FILE, None, Verdict(False, reason)
     weights = candidate if candidate.exists() else run / CHECKPOINT_FILE
@@ -170,7 +169,12 @@ def _judged(
     if verdict.promoted:
         write_atomically(best, weights.read_bytes())
         return best, after, verdict
-    best.unlink(missing_ok=True)
+    if best.exists():  # of a former call, with fewer epochs: what it proved stays proven
+        proven = _scored(order, parts, best, "proven")
+        former = judge(before, proven)
+        if former.promoted:
+            reason = f"{former.reason}; these are weights of a former call, those of this one are {verdict.reason}"
+            return best, proven, replace(former, reason=reason)
     return weights, after, verdict
 
 
