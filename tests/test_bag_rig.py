@@ -87,6 +87,16 @@ def test_a_rig_file_is_only_overwritten_by_force(tmp_path: Path, capsys: pytest.
     assert load_rig_layout(existing).names
 
 
+def test_a_mask_made_by_hand_is_only_overwritten_by_force(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    mask = tmp_path / "refused_masks" / "back.png"
+    mask.parent.mkdir()
+    mask.write_bytes(b"made by hand")
+    assert "back.png: exists already; --force overwrites it" in refusal(SAMPLE, tmp_path, capsys, "--masks")
+    assert mask.read_bytes() == b"made by hand"
+    write_rig(SAMPLE, tmp_path / "refused.yaml", "--masks", "--force")
+    assert mask.read_bytes().startswith(b"\x89PNG")
+
+
 def test_the_anchor_can_be_chosen_among_the_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert load_rig_layout(write_rig(SAMPLE, tmp_path / "rig.yaml", "--anchor", "back")).anchor == "back"
     capsys.readouterr()

@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--base-frame", default="base_link", metavar="FRAME", help="the vehicle's frame [base_link]")
     parser.add_argument("--anchor", metavar="NAME", help="camera whose stamp a set carries [the front one]")
     parser.add_argument("--masks", action="store_true", help="find the vehicle's own body (reads the whole recording)")
-    parser.add_argument("--force", action="store_true", help="overwrite the rig file")
+    parser.add_argument("--force", action="store_true", help="overwrite the rig file and its masks")
     add_json(parser)
 
 
@@ -45,14 +45,15 @@ def execute(arguments: argparse.Namespace) -> None:
     from cvcdepth_ros.bags import open_recording
     from cvcdepth_ros.recorded_rig import discover_rig
 
-    if arguments.output.exists() and not arguments.force:
-        raise ConfigError(f"{arguments.output}: exists already; --force overwrites it")
+    _refuse_to_overwrite([] if arguments.force else [arguments.output])
     with open_recording(arguments.recording) as recording:
         layout = discover_rig(recording, arguments.base_frame)
         path = recording.path
     layout = layout.model_copy(update={"anchor": _anchor(layout, arguments.anchor)})
     if arguments.masks:
-        layout = _with_found_masks(layout, path, arguments.output)
+        folder = arguments.output.parent / f"{arguments.output.stem}_masks"
+        _refuse_to_overwrite([] if arguments.force else [folder / f"{name}.png" for name in layout.names])
+        layout = _with_found_masks(layout, path, folder)
     result = _describe(layout, layout.complete())
     source = f"bag_replay rig {package_version()}, from the recording {path.name}"
     save_rig_layout(arguments.output, layout, f"Written by {source}.\n{_overlaps_text(result)}")
@@ -60,13 +61,19 @@ def execute(arguments: argparse.Namespace) -> None:
     print_result(result, _text(result), arguments.json)
 
 
-def _with_found_masks(layout: "RigLayout", recording: "Location", output: Path) -> "RigLayout":
+def _refuse_to_overwrite(files: list[Path]) -> None:
+    for path in files:
+        if path.exists():
+            raise ConfigError(f"{path}: exists already; --force overwrites it")
+
+
+def _with_found_masks(layout: "RigLayout", recording: "Location", folder: Path) -> "RigLayout":
     from cvcdepth_ros.self_occlusion import find_self_occlusion, save_masks
     from cvcdepth_ros.settings import MatchingSettings
     from cvcdepth_ros.training_index import build_index
 
     masks = find_self_occlusion(build_index(recording, MatchingSettings(), layout))
-    return save_masks(layout, masks, output.parent / f"{output.stem}_masks")
+    return save_masks(layout, masks, folder)
 
 
 def _anchor(layout: "RigLayout", wanted: str | None) -> str:
