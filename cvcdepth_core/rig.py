@@ -17,6 +17,7 @@ import yaml
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from cvcdepth_core.atomic_file import write_atomically
 from cvcdepth_core.calibration import Calibration, first_validation_message
 from cvcdepth_core.errors import RigError, TransformError
 from cvcdepth_core.poses import Pose, check_rigid, pose_from_quaternion, quaternion_from_rotation
@@ -284,11 +285,14 @@ def load_rig_layout(path: Path) -> RigLayout:
 
 
 def save_rig_layout(path: Path, layout: RigLayout, comment: str = "") -> None:
-    """Write a rig file, `comment` first, masks relative to it; `load_rig_layout` gives the same layout back."""
+    """Write a rig file, `comment` first, masks relative to it; `load_rig_layout` gives the same layout back.
+
+    Raises OutputError, naming the file, where the disk does not take it.
+    """
     header = "".join(f"# {line}\n" for line in comment.splitlines())
     relative = _with_masks(layout, lambda mask: Path(os.path.relpath(mask, path.parent)))
     content = relative.model_dump(mode="json", exclude_defaults=True)
-    path.write_text(header + yaml.safe_dump(content, sort_keys=False, default_flow_style=None), encoding="utf-8")
+    write_atomically(path, (header + yaml.safe_dump(content, sort_keys=False, default_flow_style=None)).encode())
 
 
 def _calibration_of(entry: CameraEntry, calibrations: Mapping[str, Calibration]) -> Calibration:

@@ -7,6 +7,7 @@ An index is built in one pass and kept beside the run; it is built anew when a f
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import zipfile
 from collections.abc import Iterator
@@ -18,6 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cvcdepth_core.atomic_file import write_atomically
 from cvcdepth_core.errors import ImageError, RecordingError, RigError, TransformError
 from cvcdepth_core.rig import RigLayout
 from cvcdepth_ros.bags import Location, RecordedMessage, Recording, file_identities, open_recording
@@ -206,14 +208,16 @@ def _key(path: Location, matching: MatchingSettings, layout: RigLayout | None) -
 
 def _write(cached: Path, index: RecordingIndex, key: str) -> None:
     arrays = {name: getattr(index, name) for name in ("stamps", "log_times", "poses", "thumbnails")}
+    content = io.BytesIO()
     np.savez_compressed(
-        cached,
+        content,
         key=np.array(key),
         layout=np.array(index.layout.model_dump_json()),
         unplaced=np.array(index.unplaced),
         unread=np.array(json.dumps(index.unread)),
         **{name: array for name, array in arrays.items() if array is not None},
     )
+    write_atomically(cached, content.getvalue())
 
 
 def _read(cached: Path, path: Location, key: str) -> RecordingIndex | None:

@@ -13,6 +13,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from cvcdepth_core.atomic_file import write_atomically
 from cvcdepth_core.errors import RecordingError
 from cvcdepth_ros.commands.arguments import (
     add_json,
@@ -95,7 +96,7 @@ def execute(arguments: argparse.Namespace) -> None:
             **outcome,
             "damage": recording.damage,
         }
-    (arguments.output / _RESULT_FILE).write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    write_atomically(arguments.output / _RESULT_FILE, f"{json.dumps(result, indent=2)}\n".encode())
     print_result(result, _text(result), arguments.json)
     if result["interrupted"]:
         raise KeyboardInterrupt

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cvcdepth_core.atomic_file import write_atomically
 from cvcdepth_core.comparison import rank_correlation
 from cvcdepth_core.consistency import AgreementTable
 from cvcdepth_core.metrics import METRIC_NAMES, metrics_of
@@ -97,13 +99,14 @@ def write_csv(path: Path, images: Iterable[ImageScore]) -> None:
     """Write a table with a line per image; numbers as Python writes them, nothing where there is none."""
     scaled = [f"{name}_median_scaled" for name in METRIC_NAMES]
     plain = ("recording", "stamp_ns", "camera", "truth_points", "coverage", "scale")
-    with path.open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow([*plain, *METRIC_NAMES, *scaled, *LabelFree._fields])
-        for image in images:
-            numbers = [image.coverage, image.scale, *image.metrics.values(), *image.scaled.values(), *image.label_free]
-            cells = ["" if math.isnan(number) else repr(number) for number in numbers]
-            writer.writerow([image.recording, image.stamp_ns, image.camera, image.truth_points, *cells])
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow([*plain, *METRIC_NAMES, *scaled, *LabelFree._fields])
+    for image in images:
+        numbers = [image.coverage, image.scale, *image.metrics.values(), *image.scaled.values(), *image.label_free]
+        cells = ["" if math.isnan(number) else repr(number) for number in numbers]
+        writer.writerow([image.recording, image.stamp_ns, image.camera, image.truth_points, *cells])
+    write_atomically(path, stream.getvalue().encode())
 
 
 def _image_score(table: Measurements, number: int, camera: int, group: int, label_free: LabelFree) -> ImageScore:
