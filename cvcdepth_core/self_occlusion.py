@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cvcdepth_core.errors import RigError
 from cvcdepth_core.images import Picture
 from cvcdepth_core.pointcloud import pixel_rays
 from cvcdepth_core.preprocess import SurroundPreprocessor, raw_pixels
@@ -70,10 +71,15 @@ class SelfOcclusionFinder:
     def scene(self) -> NDArray[np.bool_]:
         """Return where each rectified picture shows the scene [N, H, W], False on the vehicle itself.
 
-        Without MIN_PAIRS pairs nothing is known and everything counts as scene.
+        Without MIN_PAIRS pairs nothing is known and everything counts as scene. RigError when no camera sees ground.
         """
         if self.pairs < MIN_PAIRS:
             return np.ones_like(self._examined)
+        if not self._examined.any():
+            raise RigError(
+                f"camera {', '.join(self._rig.names)}: none sees ground, which its own body is told from: does "
+                "frame_id name the optical frame, whose z looks forward and whose y looks down?"
+            )
         changes, textures = (
             np.stack([cv2.blur(image / self.pairs, (_WINDOW, _WINDOW)) for image in sums])
             for sums in (self._changes, self._shift_changes)

@@ -97,6 +97,18 @@ def test_a_mask_made_by_hand_is_only_overwritten_by_force(tmp_path: Path, capsys
     assert mask.read_bytes().startswith(b"\x89PNG")
 
 
+def test_cameras_of_which_none_sees_ground_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    def look_up(message: Any) -> None:
+        for link in message.transforms:
+            q = link.transform.rotation
+            q.x, q.y, q.z, q.w = 0.0, 0.0, 0.0, 1.0  # as a body frame: z up
+
+    entries = recordings.changed(recordings.sample_entries(), "/tf_static", look_up)
+    body = recordings.write_rosbag2(tmp_path / "body", entries)
+    line = refusal(body, tmp_path, capsys, "--masks", "--anchor", "front")
+    assert f"camera {', '.join(sorted(CAMERAS))}: none sees ground" in line
+
+
 def test_the_anchor_can_be_chosen_among_the_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert load_rig_layout(write_rig(SAMPLE, tmp_path / "rig.yaml", "--anchor", "back")).anchor == "back"
     capsys.readouterr()
