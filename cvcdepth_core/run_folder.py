@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 import json
+import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -46,8 +47,19 @@ class RunFolder:
         write_atomically(self.state, content.getvalue())
 
     def read_state(self) -> bytes:
-        """Return the bytes of what `write_state` wrote last, or none."""
-        return self.state.read_bytes() if self.state.exists() else b""
+        """Return the bytes of what `write_state` wrote last, or none; CheckpointError when the file is empty."""
+        content = self.state.read_bytes() if self.state.exists() else None
+        if content == b"":
+            raise CheckpointError(f"{self.state}: is empty (0 bytes); remove it to start the run anew")
+        return content or b""
+
+    def state_from(self, content: bytes, device: torch.device) -> dict[str, Any]:
+        """Return what `write_state` was given, from what `read_state` gave; CheckpointError when it is damaged."""
+        try:
+            return dict(torch.load(io.BytesIO(content), map_location=device, weights_only=True))
+        except (RuntimeError, pickle.UnpicklingError, EOFError, KeyError, TypeError, ValueError) as error:
+            reason = str(error).partition("\n")[0]
+            raise CheckpointError(f"{self.state}: is damaged ({reason}); remove it to start the run anew") from error
 
     def append_to_log(self, entry: Mapping[str, Any]) -> None:
         """Add a line to the log."""

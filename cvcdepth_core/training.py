@@ -8,7 +8,6 @@ uninterrupted one does, a checkpoint needs no generator's state, and it does not
 
 from __future__ import annotations
 
-import io
 import json
 import math
 import os
@@ -219,7 +218,7 @@ class Trainer:
     def _resume(self) -> None:
         content = self._processes.told_by_first(self._folder.read_state() if self._processes.is_first else b"")
         if content:
-            state = torch.load(io.BytesIO(content), map_location=self._device, weights_only=True)
+            state = self._folder.state_from(content, self._device)
             self._identity.refuse_other(state, self._folder.state)
             self.progress = Progress(**state["progress"])
             self.validations = json.loads(state["validations"])

@@ -149,6 +149,21 @@ def test_a_folder_of_a_run_that_was_made_from_something_else_is_refused_by_what_
         made_from(start="a", mask="d")
 
 
+@pytest.mark.parametrize("left", [0.0, 0.001, 0.5, 0.999])
+def test_a_damaged_state_is_named(uninterrupted, tmp_path, left):
+    content = (uninterrupted / "state.pt").read_bytes()
+    (tmp_path / "state.pt").write_bytes(content[: int(left * len(content))])
+    with pytest.raises(CheckpointError, match=r"state.pt: is (empty|damaged) .*remove it to start") as error:
+        trainer(tmp_path)
+    assert "\n" not in str(error.value)
+
+
+def test_a_state_that_is_something_else_is_named(tmp_path):
+    (tmp_path / "state.pt").write_bytes(b"x" * 1000)
+    with pytest.raises(CheckpointError, match=r"state.pt: is damaged"):
+        trainer(tmp_path)
+
+
 def test_the_average_of_the_weights_is_what_is_saved_and_validated(tmp_path):
     settings = config(epochs=1)
     seen = []
