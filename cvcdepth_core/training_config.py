@@ -48,7 +48,7 @@ class RecordingsConfig(_Section):
     """Which moments of recordings become training samples, and how they are read."""
 
     held_out: float = Field(default=0.25, ge=0, lt=1)
-    """The last share of every recording, by time, that is never trained on."""
+    """The last share of every recording's surround sets that is never trained on."""
     min_travel: float = Field(default=0.1, ge=0, allow_inf_nan=False)
     """Metres between a sample's target and each of its context frames, at least; nearer sets are passed over."""
     min_image_change: float = Field(default=2.0, ge=0, allow_inf_nan=False)

@@ -6,6 +6,7 @@ Pictures go through the node's own decoding and preprocessing, so that the netwo
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -44,10 +45,12 @@ class Sample(NamedTuple):
     after: int
 
 
-def split_stamp(index: RecordingIndex, held_out: float) -> int:
-    """Return the anchor stamp (ns) after which sets are held out."""
-    first, last = (int(stamp) for stamp in index.stamps[[0, -1], index.anchor])
-    return last - round(held_out * (last - first))
+def first_held_out(index: RecordingIndex, held_out: float) -> int:
+    """Return the number of the first set that is held out; of no set where none is.
+
+    Sets are counted, not seconds: stamps may jump, from 1970 to now when the clock is set while the vehicle drives.
+    """
+    return len(index) - math.ceil(held_out * (len(index) - 1))
 
 
 def find_samples(index: RecordingIndex, config: RecordingsConfig, part: Part, recording: int = 0) -> list[Sample]:
@@ -55,8 +58,7 @@ def find_samples(index: RecordingIndex, config: RecordingsConfig, part: Part, re
 
     A sample's contexts are the nearest sets before and after the target that the vehicle has moved far enough from.
     """
-    stamps = index.stamps[:, index.anchor]
-    held_out = stamps > split_stamp(index, config.held_out)
+    held_out = np.arange(len(index)) >= first_held_out(index, config.held_out)
     members = np.flatnonzero(held_out == (part == "held_out"))
     samples = []
     for target in members.tolist():

@@ -9,7 +9,7 @@ from itertools import chain
 import numpy as np
 import pytest
 import torch
-from recordings import JAZZY, SAMPLE, Entry, changed, cut, sample_entries, write_rosbag2
+from recordings import CAMERAS, JAZZY, SAMPLE, Entry, changed, cut, restamped, sample_entries, write_rosbag2
 
 from cvcdepth_core.checkpoint import DepthModelSpec
 from cvcdepth_core.distributed import Processes
@@ -17,6 +17,7 @@ from cvcdepth_core.errors import RecordingError, RigError
 from cvcdepth_core.preprocess import SurroundPreprocessor
 from cvcdepth_core.training_config import OptimizerConfig, RecordingsConfig, TrainingConfig
 from cvcdepth_ros.bags import open_recording
+from cvcdepth_ros.finetuning.held_out import held_out_parts
 from cvcdepth_ros.messages import picture_from_message, stamp_ns
 from cvcdepth_ros.recorded_rig import discover_rig
 from cvcdepth_ros.settings import MatchingSettings
@@ -86,6 +87,20 @@ def test_no_sample_reaches_from_one_part_into_the_other(index):
     assert held_out
     assert max(chain.from_iterable(sample[1:] for sample in training)) == 5
     assert min(chain.from_iterable(sample[1:] for sample in held_out)) == 6
+
+
+def test_a_clock_that_is_set_meanwhile_does_not_change_what_is_held_out(tmp_path):
+    entries = without(sample_entries(), "/odom", "/tf")
+    for topic in [f"/camera/{name}/image_raw/compressed" for name in CAMERAS]:
+        entries = list(restamped(entries, topic, lambda number, ns: ns % 10**15 if number < 4 else ns))
+    index = build_index(write_rosbag2(tmp_path / "set", entries), MATCHING)
+    assert np.ptp(index.stamps[:, index.anchor]) > 10**18
+    part = RecordingsConfig(held_out=0.4)
+    training, held_out = (find_samples(index, part, name) for name in ("training", "held_out"))
+    assert max(chain.from_iterable(sample[1:] for sample in training)) == 3
+    assert min(chain.from_iterable(sample[1:] for sample in held_out)) == len(index) - 4 == 6
+    (found,) = held_out_parts([index], config(recordings=part), "cpu")
+    assert found.spans[0][0] > index.log_times[:6].max()
 
 
 def test_a_gap_is_not_bridged(tmp_path):

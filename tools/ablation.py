@@ -32,7 +32,7 @@ from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.settings import MatchingSettings
 from cvcdepth_ros.synchronizer import NANOSECONDS
 from cvcdepth_ros.training_index import RecordingIndex, load_index
-from cvcdepth_ros.training_samples import RecordingBatches, split_stamp
+from cvcdepth_ros.training_samples import RecordingBatches, first_held_out
 
 PUBLISHED = Path(__file__).parent.parent / "config" / "training" / "ablation"
 VARIANTS = {
@@ -99,7 +99,8 @@ def train(run: Run, index: RecordingIndex, start: Path | None) -> None:
 def evaluate(run: Run, index: RecordingIndex, options: argparse.Namespace) -> dict[str, Any]:
     """Score the held-out part with the bag tool, as a user would; return what metrics.json says."""
     with open_recording(index.path) as recording:
-        start = (split_stamp(index, run.config.recordings.held_out) + 1 - recording.start) / NANOSECONDS
+        first = index.log_times[first_held_out(index, run.config.recordings.held_out)].min()
+        start = (int(first) - recording.start) / NANOSECONDS
     command = [sys.executable, "-m", "cvcdepth_ros.bag_replay", "evaluate", str(index.path), "--quiet", "--no-report"]
     command += ["--checkpoint", str(run.folder / CHECKPOINT_FILE), "--start", f"{start:.6f}"]
     command += ["-o", str(run.folder / "scores"), *(["--rig", str(options.rig)] if options.rig else [])]

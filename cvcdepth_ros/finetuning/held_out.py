@@ -18,7 +18,7 @@ from cvcdepth_ros.evaluation.result import EvaluationResult
 from cvcdepth_ros.evaluation.workers import KeptParts, evaluate_all
 from cvcdepth_ros.synchronizer import NANOSECONDS
 from cvcdepth_ros.training_index import RecordingIndex
-from cvcdepth_ros.training_samples import split_stamp
+from cvcdepth_ros.training_samples import first_held_out
 
 _BAR = "{desc}: {percentage:3.0f}%|{bar}| {n:.1f} of {total} recordings [{elapsed}<{remaining}]"
 _FEWEST_SETS = 2  # the scores along the way need two
@@ -64,8 +64,7 @@ def held_out_parts(indexes: Sequence[RecordingIndex], config: TrainingConfig, de
 
 
 def _held_out_part(index: RecordingIndex, job: EvaluationJob, config: TrainingConfig) -> HeldOutPart | None:
-    split = split_stamp(index, config.recordings.held_out)
-    log_times = index.log_times[np.flatnonzero(index.stamps[:, index.anchor] > split)]
+    log_times = index.log_times[first_held_out(index, config.recordings.held_out) :]
     if not len(log_times):
         return None
     with open_recording(index.path) as recording:
