@@ -24,6 +24,7 @@ from torch.utils.data import DataLoader, Dataset
 from cvcdepth_core.distributed import ALONE, Processes
 from cvcdepth_core.errors import ImageError, RecordingError
 from cvcdepth_core.images import Picture
+from cvcdepth_core.networks.pose import MAX_TRANSLATION
 from cvcdepth_core.poses import inverse
 from cvcdepth_core.preprocess import SurroundPreprocessor
 from cvcdepth_core.rig_batch import RigBatch
@@ -57,7 +58,32 @@ def find_samples(index: RecordingIndex, config: RecordingsConfig, part: Part, re
     """Return the samples of one part of a recording, none of whose sets is of the other part.
 
     A sample's contexts are the nearest sets before and after the target that the vehicle has moved far enough from.
+    Where they are known to be farther than the pose network can tell, there is no sample (`told_beyond_reach`).
     """
+    found = _within_interval(index, config, part, recording)
+    return [sample for sample in found if _travel(index, sample) <= MAX_TRANSLATION]
+
+
+def told_beyond_reach(index: RecordingIndex, config: RecordingsConfig) -> str | None:
+    """Say how many training samples are left out since the vehicle moves too far between their sets, if any."""
+    travels = [_travel(index, sample) for sample in _within_interval(index, config, "training")]
+    too_far = [travel for travel in travels if travel > MAX_TRANSLATION]
+    if not too_far:
+        return None
+    return (
+        f"{len(too_far)} training samples are left out: the vehicle moves up to {max(too_far):.1f} m between two of "
+        f"their sets, and the pose network tells no more than {MAX_TRANSLATION:g}"
+    )
+
+
+def _travel(index: RecordingIndex, sample: Sample) -> float:
+    """Return the recorded metres from the target to the farther context; 0 where no motion is recorded."""
+    if index.poses is None:
+        return 0.0
+    return max(change_between(index, sample.target, other) for other in (sample.before, sample.after))
+
+
+def _within_interval(index: RecordingIndex, config: RecordingsConfig, part: Part, recording: int = 0) -> list[Sample]:
     held_out = np.arange(len(index)) >= first_held_out(index, config.held_out)
     members = np.flatnonzero(held_out == (part == "held_out"))
     samples = []
@@ -106,6 +132,8 @@ def _why_no_sample(index: RecordingIndex, config: RecordingsConfig) -> str:
     changes = [change_between(index, first, second) for first, second in pairwise(range(len(index)))]
     largest = max(changes, default=0.0)
     unplaced = f", {index.unplaced} more lie outside of the recorded motion" if index.unplaced else ""
+    if beyond := told_beyond_reach(index, config):
+        return f"{index.path}: no training sample in {len(index)} sets{unplaced}: {beyond}"
     if index.poses is not None:
         motion = f"the vehicle moves {largest:.3f} m at most from one to the next, min_travel is {config.min_travel:g}"
     else:

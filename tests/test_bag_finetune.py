@@ -357,6 +357,22 @@ def test_too_little_motion_for_the_configuration_is_refused(config, tmp_path, ca
     assert "min_travel is 9" in error
 
 
+def test_samples_that_are_too_far_apart_are_told(config, tmp_path, capsys):
+    entries = recordings.sample_entries()
+    middle = (entries[0].log_time + entries[-1].log_time) / 2
+
+    def jump(message: Any) -> None:
+        for link in message.transforms:
+            stamp = link.header.stamp
+            link.transform.translation.x += 6.0 * (stamp.sec * 10**9 + stamp.nanosec > middle)
+
+    fast = recordings.write_rosbag2(tmp_path / "fast", recordings.changed(entries, "/tf", jump))
+    one_step = config(optimizer={"epochs": 1, "samples_per_step": 9}, recordings={"held_out": 0, "min_travel": 0.1})
+    finetune(one_step, tmp_path / "run", *CHEAP, bags=(fast,))
+    told = f"warning: {fast}: 2 training samples are left out: the vehicle moves up to 6."
+    assert told in capsys.readouterr().err
+
+
 def test_a_missing_camera_is_refused(config, tmp_path, capsys):
     entries = recordings.without(recordings.sample_entries(3), "/camera/left/image_raw/compressed")
     assert "bag: check 1, cameras: 5 found" in refusal(entries, config, tmp_path, capsys)

@@ -2,6 +2,7 @@
 """Training samples from recordings: which moments, what pictures, where each camera was."""
 
 import os
+import re
 from collections.abc import Iterable
 from dataclasses import replace
 from itertools import chain
@@ -22,7 +23,14 @@ from cvcdepth_ros.messages import picture_from_message, stamp_ns
 from cvcdepth_ros.recorded_rig import discover_rig
 from cvcdepth_ros.settings import MatchingSettings
 from cvcdepth_ros.training_index import build_index, load_index
-from cvcdepth_ros.training_samples import RecordingBatches, SampleReader, _collate, find_samples, refuse_standstill
+from cvcdepth_ros.training_samples import (
+    RecordingBatches,
+    SampleReader,
+    _collate,
+    find_samples,
+    refuse_standstill,
+    told_beyond_reach,
+)
 
 MATCHING = MatchingSettings()
 EVERYTHING = RecordingsConfig(held_out=0.0)
@@ -87,6 +95,20 @@ def test_no_sample_reaches_from_one_part_into_the_other(index):
     assert held_out
     assert max(chain.from_iterable(sample[1:] for sample in training)) == 5
     assert min(chain.from_iterable(sample[1:] for sample in held_out)) == 6
+
+
+def test_samples_between_whose_sets_the_vehicle_moves_too_far_are_left_out_and_told(index):
+    poses = index.poses.copy()
+    poses[6:, :, 0, 3] += 5.0
+    jumping = replace(index, poses=poses)
+    samples = find_samples(jumping, EVERYTHING, "training")
+    assert [sample.target for sample in samples] == [1, 2, 3, 4, 7, 8]
+    told = told_beyond_reach(jumping, EVERYTHING)
+    assert re.match(r"2 training samples are left out: the vehicle moves up to 5\.\d m between two", told)
+    assert told_beyond_reach(index, EVERYTHING) is None
+    fast = replace(index, poses=np.where(np.arange(4) == 3, 20 * index.poses, index.poses))
+    with pytest.raises(RecordingError, match=r"no training sample in 10 sets: 8 training samples are left out"):
+        RecordingBatches([fast], config())
 
 
 def test_a_clock_that_is_set_meanwhile_does_not_change_what_is_held_out(tmp_path):

@@ -9,8 +9,10 @@ from torch.nn import functional as F  # noqa: N812 - the field's name for it
 
 from cvcdepth_core.networks.encoders import build_encoder
 
+MAX_TRANSLATION = 4.0
+"""Metres along each axis beyond which no motion is predicted."""
+
 _OUTPUT_SCALE = 0.01
-_MAX_TRANSLATION = 4.0
 
 
 class PoseNet(nn.Module):
@@ -33,7 +35,7 @@ class PoseNet(nn.Module):
         features: Tensor = self.pose_encoder(pairs.flatten(0, 1))[-1]
         fused = features.view(*pairs.shape[:2], *features.shape[1:]).mean(dim=1)
         vector: Tensor = self.pose_decoder(fused)
-        return vector[:, :3], vector[:, 3:].clamp(-_MAX_TRANSLATION, _MAX_TRANSLATION)
+        return vector[:, :3], vector[:, 3:].clamp(-MAX_TRANSLATION, MAX_TRANSLATION)
 
 
 class PoseDecoder(nn.Module):

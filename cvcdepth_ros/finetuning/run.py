@@ -26,7 +26,7 @@ from cvcdepth_ros.finetuning.judgement import Verdict, judge
 from cvcdepth_ros.finetuning.monitoring import TensorBoardObserver, has_tensorboard
 from cvcdepth_ros.finetuning.preparation import Prepared, Source, prepare
 from cvcdepth_ros.finetuning.validation import CANDIDATE_FILE, HeldOutValidation
-from cvcdepth_ros.training_samples import RecordingBatches
+from cvcdepth_ros.training_samples import RecordingBatches, told_beyond_reach
 from cvcdepth_ros.version import package_version
 
 START_FILE, BEST_FILE = "start.safetensors", "best.safetensors"
@@ -81,6 +81,11 @@ def fine_tune(order: Order, processes: Processes, tell: Tell) -> FineTuned | Non
     """
     with processes.first_goes_ahead():
         prepared = prepare(order.source, order.run)
+    prepared.warnings += [
+        f"{index.path}: {told}"
+        for index in prepared.indexes
+        if (told := told_beyond_reach(index, order.config.recordings))
+    ]
     if processes.is_first:
         for text in (*(f"left out: {reason}" for reason in prepared.left_out.values()), *prepared.warnings):
             tell(text)
