@@ -125,11 +125,11 @@ class RunIdentity:
                 f"{path}: {state['samples_together']} samples went through the networks together, now it is "
                 f"{self.samples_together} (optimizer.samples_per_batch x {processes} processes)"
             )
+        self._refuse_other_inputs(json.loads(state.get("inputs", "{}")), path)
         if state["samples"] != self.samples:
             raise CheckpointError(
                 f"{path}: was made from {state['samples']} samples, now there are {self.samples}; choose another folder"
             )
-        self._refuse_other_inputs(json.loads(state.get("inputs", "{}")), path)
 
     def _refuse_other_inputs(self, were: Mapping[str, str], path: Path) -> None:
         differences = [
@@ -147,7 +147,8 @@ def _configuration(path: Path, state: Mapping[str, Any]) -> TrainingConfig:
     try:
         return TrainingConfig.model_validate_json(state["config"])
     except ValidationError as error:
-        raise CheckpointError(f"{path}: its configuration is not one of this version: {error}") from error
+        reason = " ".join(str(error).split())
+        raise CheckpointError(f"{path}: its configuration is not one of this version: {reason}") from error
 
 
 def _what_is_computed(config: TrainingConfig) -> dict[str, Any]:

@@ -306,6 +306,10 @@ def test_a_run_that_holds_nothing_out_goes_on_with_the_same_recordings_and_start
     error = capsys.readouterr().err
     assert "recording 1 was pandaset_002_excerpt (" in error
     assert "recording 2 was short (" in error
+    assert finetune(path, tmp_path / "run", *CHEAP) == 1
+    error = capsys.readouterr().err
+    assert "was made from something else: recording 2 was short (" in error
+    assert "), now it is none; " in error
     start = better.folder / "candidate.safetensors"
     assert finetune(path, tmp_path / "run", "--from", start, *CHEAP, bags=(SAMPLE, short)) == 1
     assert "the start was random weights, now it is candidate.safetensors sha256:" in capsys.readouterr().err

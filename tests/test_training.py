@@ -164,6 +164,15 @@ def test_a_state_that_is_something_else_is_named(tmp_path):
         trainer(tmp_path)
 
 
+def test_a_state_of_another_versions_configuration_is_named_in_one_line(uninterrupted, tmp_path):
+    state = torch.load(uninterrupted / "state.pt", weights_only=True)
+    state["config"] = state["config"].replace('"max_depth":200.0', '"flip_fusion":true')
+    torch.save(state, tmp_path / "state.pt")
+    with pytest.raises(CheckpointError, match=r"state.pt: its configuration .* evaluation.flip_fusion") as error:
+        trainer(tmp_path)
+    assert "\n" not in str(error.value)
+
+
 def test_the_average_of_the_weights_is_what_is_saved_and_validated(tmp_path):
     settings = config(epochs=1)
     seen = []
