@@ -18,9 +18,10 @@ older than those used are dropped. If not, the anchor image is dropped and the o
 
 **With missing cameras.** `min_cameras` lets sets leave that lack cameras. A camera is then no longer waited for once
 its newest image lies more than three periods behind the anchor's newest; it takes part again with its next image. The
-anchor itself is missing when so many others as a set needs are that far ahead of it; the first camera that is not
-stands in until it returns. Of images that are farther apart than the tolerance, those farthest from the anchor stay
-behind.
+anchor itself is missing when so many others as a set needs are that far ahead of it, and of no use when most cameras,
+all of which send images, lie that far behind it: then its clock is wrong. The first camera of which neither is true
+stands in until the anchor returns. Of images that are farther apart than the tolerance, those farthest from the anchor
+stay behind.
 
 **When.** As soon as waiting cannot bring a nearer image: every camera has sent one at or after the anchor's stamp, or
 its period (median of the last intervals) says that its next will not be nearer than the best one queued. Likewise an
@@ -42,7 +43,7 @@ import math
 import threading
 from bisect import insort
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Generic, TypeVar
 
@@ -131,6 +132,7 @@ class SurroundSynchronizer(Generic[T]):
         self._acting_anchor = anchor
         self._last_stamp: int | None = None  # the acting anchor's corrected one of the last set
         self._sets = 0
+        self._arrivals = 0
         self._lock = threading.Lock()
 
     @classmethod
@@ -150,7 +152,8 @@ class SurroundSynchronizer(Generic[T]):
         if stream is None:
             raise ConfigError(f"camera: {camera!r} is not one of {', '.join(self._streams)}")
         with self._lock:
-            stream.accept(stamp_ns - stream.offset, image)
+            self._arrivals += 1
+            stream.accept(stamp_ns - stream.offset, image, self._arrivals)
             return self._decide(final=False)
 
     def flush(self) -> list[SurroundSet[T]]:
@@ -196,19 +199,30 @@ class SurroundSynchronizer(Generic[T]):
 
     def _appoint_anchor(self) -> None:
         """Let another camera stand in for an anchor that is missing, and the anchor return when it is there."""
+        if self.required == len(self._streams):
+            return
         candidates = (self._anchor, *self._streams)
-        acting = next((name for name in candidates if not self._is_left_behind(name)), self._acting_anchor)
+        ahead = {name for name in self._streams if self._is_ahead(name)}
+        acting = next(
+            (name for name in candidates if name not in ahead and not self._is_left_behind(name, ahead)),
+            self._acting_anchor,
+        )
         if acting != self._acting_anchor:
             self._acting_anchor = acting
             if self._last_stamp is not None:
                 self._streams[acting].drop_before(self._last_stamp + 1)  # sets come in increasing time
 
-    def _is_left_behind(self, camera: str) -> bool:
-        """Whether enough others for a set have gone on without this camera."""
-        if self.required == len(self._streams):
-            return False
+    def _is_ahead(self, camera: str) -> bool:
+        """Whether most cameras send images whose stamps lie so far behind this one's that its clock must be wrong."""
         stream = self._streams[camera]
-        return sum(_is_missing(stream, other) for other in self._streams.values()) >= self.required
+        behind = [s for s in self._streams.values() if _is_missing(s, stream) and s.has_sent_since(stream)]
+        return 2 * len(behind) > len(self._streams)
+
+    def _is_left_behind(self, camera: str, ahead: Collection[str]) -> bool:
+        """Whether enough others for a set have gone on without this camera, not counting those with a wrong clock."""
+        stream = self._streams[camera]
+        others = (other for name, other in self._streams.items() if name not in ahead)
+        return sum(_is_missing(stream, other) for other in others) >= self.required
 
     def _is_worth_waiting(self, stream: "_Stream[T]", anchor: int, stamp: int | None) -> bool:
         """Whether a nearer image of this camera, or one that says where the queued one belongs, may still come."""
@@ -265,14 +279,16 @@ class _Stream(Generic[T]):
         self._floor: int | None = None  # latest stamp that left the queue: nothing up to it can be used any more
         self._behind: list[int] = []  # the stamps that arrived last, while they ascend and are older than the newest
         self._intervals: deque[int] = deque(maxlen=_INTERVALS_FOR_PERIOD)
+        self._arrivals: deque[int] = deque(maxlen=_PATIENCE_PERIODS)  # numbers, counted over all cameras
         self._queue_size = queue_size
         self._clock_jump = clock_jump
         self._received = self._matched = self._missed = self._clock_steps = 0
         self._dropped: Counter[str] = Counter()
 
-    def accept(self, stamp: int, image: T) -> None:
-        """Queue the image, or count why not."""
+    def accept(self, stamp: int, image: T, arrival: int) -> None:
+        """Queue the image, or count why not; `arrival` counts the images of all cameras."""
         self._received += 1
+        self._arrivals.append(arrival)
         if self._steps_back(stamp):
             self._clock_steps += 1
             self.clear("clock_jump")
@@ -306,6 +322,10 @@ class _Stream(Generic[T]):
         if stamp is None or self.period is None:
             return True
         return _distance(self.newest + self.period, anchor) < _distance(stamp, anchor)
+
+    def has_sent_since(self, other: "_Stream[T]") -> bool:
+        """Whether an image has come since the other camera's last few: what sends nothing has no wrong clock."""
+        return bool(self._arrivals and other._arrivals) and self._arrivals[-1] > other._arrivals[0]
 
     def take(self, stamp: int) -> T:
         """Remove a queued image for a set; the older ones are passed over."""

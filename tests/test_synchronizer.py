@@ -651,6 +651,23 @@ def test_another_camera_stands_in_for_the_anchor_until_it_returns():
     assert stamps == sorted(set(stamps))
 
 
+@pytest.mark.parametrize("min_cameras", [1, 4, 5])
+@pytest.mark.parametrize("camera", ["front", "back"])
+@pytest.mark.parametrize("ahead", [15 * PERIOD, 36_000 * PERIOD])
+@pytest.mark.parametrize("healthy", [0, 5])
+def test_a_camera_whose_clock_is_ahead_costs_its_own_images_only_even_when_it_is_the_anchor(
+    min_cameras: int, camera: str, ahead: int, healthy: int
+):
+    synchronizer = partial_synchronizer(min_cameras)
+    feed(synchronizer, cycles(PANDASET, 0, healthy), flush=False)
+    wrong = [(name, stamp + ahead * (name == camera)) for name, stamp in cycles(PANDASET, healthy, 20)]
+    sets = [s for s in feed(synchronizer, wrong, flush=False) if len(s.images) == 5]
+    assert len(sets) >= 14
+    assert all(list(s.images) == without(camera) and s.anchor == without(camera)[0] for s in sets)
+    mended = feed(synchronizer, cycles(PANDASET, healthy + 20, 10))
+    assert [(s.anchor, len(s.images)) for s in mended][-5:] == [("front", 6)] * 5
+
+
 def test_too_few_cameras_give_no_set():
     synchronizer = partial_synchronizer(4)
     assert feed(synchronizer, cycles(without("left", "back", "right"), 0, 10)) == []
