@@ -109,14 +109,8 @@ class RigAssembler:
         return self.layout.model_copy(update={"cameras": ordered})
 
     def _layout_of(self, names: Collection[str]) -> RigLayout:
-        """Leave the other cameras out, also from the given neighbours; the first camera stands in for the anchor."""
-        entries = tuple(
-            entry.model_copy(update={"neighbours": tuple(n for n in entry.neighbours if n in names)})
-            if entry.neighbours
-            else entry
-            for entry in self.layout.cameras
-            if entry.name in names
-        )
+        """Leave the other cameras out; the first camera stands in for the anchor."""
+        entries = tuple(entry for entry in self.layout.cameras if entry.name in names)
         anchor = self.layout.anchor if self.layout.anchor in names else None
         return self.layout.model_copy(update={"cameras": entries, "anchor": anchor})
 

@@ -136,7 +136,7 @@ class SurroundSession:
         assembler, states = self._assembler, CameraState
         reasons = [
             (states.REJECTED, assembler.refusal(camera)),
-            (states.REJECTED, self._pipeline.rig_problem or None),
+            (states.REJECTED, self._pipeline.rig_problems.get(camera)),
             (states.WAITING_FOR_CAMERA_INFO, assembler.calibration_problem(camera)),
             (states.WAITING_FOR_TRANSFORM, assembler.transform_problem(camera)),
         ]
