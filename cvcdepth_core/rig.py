@@ -7,6 +7,7 @@ A `RigLayout` is what a YAML file holds. It may leave calibrations and transform
 
 import math
 import os
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -107,6 +108,10 @@ class RigLayout(BaseModel):
         repeated = sorted({name for name in names if names.count(name) > 1})
         if repeated:
             raise ValueError(f"two cameras are called {', '.join(repeated)}")
+        for topic, count in Counter(camera.image_topic for camera in self.cameras).items():
+            if count > 1:
+                sharing = [camera.name for camera in self.cameras if camera.image_topic == topic]
+                raise ValueError(f"image_topic: {topic} is that of {' and '.join(sharing)}")
         if self.anchor is not None and self.anchor not in names:
             raise ValueError(f"anchor: no camera is called {self.anchor}; there are {', '.join(names)}")
         for camera in self.cameras:

@@ -226,6 +226,8 @@ class SurroundPipeline:
         rectifiers = surround.preprocessor.rectifiers
         images = {name: image for name, image in surround_set.images.items() if name in rectifiers}
         wanted = {name: image for name, image in images.items() if self._wanted(name)}
+        for name in images.keys() - wanted.keys():
+            self._watches[name].used("")  # nothing is known against an image that nobody looks at
         if not wanted:
             self.counters["skipped: no subscriber"] += 1
             return
