@@ -225,7 +225,11 @@ class SurroundDepthNode(ManagedNode):
         return SetParametersResult(successful=True)
 
     def _replace_model(self, parameters: NodeParameters) -> None:
-        """Load another checkpoint beside the one that runs, and swap them between two sets; the family's errors."""
+        """Load another checkpoint beside the one that runs, and swap them between two sets; the family's errors.
+
+        Images that arrive meanwhile wait or are dropped, for this is a callback: half a second on two cores with NCNN,
+        but a minute where the network is compiled.
+        """
         parameters.check_complete()
         estimator = self._built_estimator(parameters)
         session = self._session
