@@ -36,7 +36,7 @@ queue is bounded: a dead camera only means that the others drop their oldest ima
 queued or dropped for a reason.
 
 Choose an anchor that is not faster than the other cameras. Sets come in strictly increasing anchor time, and every
-camera's images too, except across a clock step, `reset` or `flush`.
+camera's images too, except across a clock step or `flush`.
 """
 
 import math
@@ -80,7 +80,7 @@ class CameraStatistics:
     matched: int
     queued: int
     # reason -> images: unmatched (passed over), duplicate_stamp, out_of_order (too late to be used), queue_full,
-    # clock_jump (queued when the clock stepped back), reset
+    # clock_jump (queued when the clock stepped back)
     dropped: dict[str, int]
     clock_steps: int  # how often the stamps stepped back
     period_ns: int | None  # None until two images have come
@@ -160,22 +160,14 @@ class SurroundSynchronizer(Generic[T]):
         """At the end of a recording: decide with what is queued, return the last sets, and start anew."""
         with self._lock:
             sets = self._decide(final=True)
-            self._clear("unmatched")
+            for stream in self._streams.values():
+                stream.clear("unmatched")
             return sets
-
-    def reset(self) -> None:
-        """Drop everything queued and forget the stamps seen; counters and periods stay."""
-        with self._lock:
-            self._clear("reset")
 
     def statistics(self) -> SynchronizerStatistics:
         """Snapshot of the counters."""
         with self._lock:
             return SynchronizerStatistics(self._sets, {name: s.statistics() for name, s in self._streams.items()})
-
-    def _clear(self, reason: str) -> None:
-        for stream in self._streams.values():
-            stream.clear(reason)
 
     def _decide(self, *, final: bool) -> list[SurroundSet[T]]:
         sets: list[SurroundSet[T]] = []

@@ -438,15 +438,6 @@ def test_flush_counts_what_no_set_could_use():
     assert (cameras["a"].dropped, cameras["b"].dropped) == ({"unmatched": 1}, {"unmatched": 2})
 
 
-def test_reset_drops_the_queues_and_keeps_the_counters():
-    synchronizer = pair()
-    add_all(synchronizer, ("b", 200), ("b", 300))
-    synchronizer.reset()
-    b = synchronizer.statistics().cameras["b"]
-    assert (b.received, b.queued, b.dropped, b.period_ns) == (2, 0, {"reset": 2}, 100 * MS)
-    assert add_all(synchronizer, ("b", 100), ("a", 100), ("a", 200), ("b", 200))[0] == {"a": 100, "b": 100}
-
-
 def test_a_faster_camera_gives_its_nearest_image_without_waiting_for_the_next():
     synchronizer = pair()
     sets = add_all(synchronizer, *sorted([("b", 30 * i) for i in range(12)] + [("a", 95)], key=lambda x: x[1]))
