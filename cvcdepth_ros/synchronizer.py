@@ -68,8 +68,14 @@ class SurroundSet(Generic[T]):
     anchor: str  # the camera around whose image the set was made
     stamp_ns: int  # the anchor image's own stamp: the stamp of everything computed from the set
     stamps_ns: dict[str, int]  # each image's own stamp, its camera's offset not subtracted
+    times_ns: dict[str, int]  # its offset subtracted: when the image was taken, by the clock of poses and LiDAR
     images: dict[str, T]
     spread_ns: int  # latest minus earliest corrected stamp
+
+    @property
+    def time_ns(self) -> int:
+        """When the anchor's image was taken."""
+        return self.times_ns[self.anchor]
 
 
 @dataclass(frozen=True)
@@ -245,6 +251,7 @@ class SurroundSynchronizer(Generic[T]):
             anchor=self._acting_anchor,
             stamp_ns=anchor + self._streams[self._acting_anchor].offset,
             stamps_ns={name: stamp + self._streams[name].offset for name, stamp in chosen.items()},
+            times_ns=dict(chosen),
             images={name: self._streams[name].take(stamp) for name, stamp in chosen.items()},
             spread_ns=max(chosen.values()) - min(chosen.values()),
         )

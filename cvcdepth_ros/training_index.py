@@ -27,7 +27,7 @@ from cvcdepth_ros.replay import RecordedImage, SurroundReplay
 from cvcdepth_ros.settings import MatchingSettings
 from cvcdepth_ros.synchronizer import SurroundSet
 
-_FORMAT = 1
+_FORMAT = 2
 _THUMBNAIL = (40, 24)
 
 
@@ -39,7 +39,9 @@ class RecordingIndex:
     layout: RigLayout
     """The rig, complete."""
     stamps: NDArray[np.int64]
-    """[S, N] each image's own stamp, ns."""
+    """[S, N] each image's own stamp, ns: by which its message is told from others."""
+    times: NDArray[np.int64]
+    """[S, N] when each image was taken, ns: its stamp without its camera's offset."""
     log_times: NDArray[np.int64]
     """[S, N] when each image was recorded, ns: where it is found again."""
     poses: NDArray[np.float64] | None
@@ -93,6 +95,7 @@ def build_index(path: Location, matching: MatchingSettings, rig_layout: RigLayou
         path=path,
         layout=layout,
         stamps=_table(sets, placed, lambda found: [found.stamps_ns[name] for name in layout.names]),
+        times=_table(sets, placed, lambda found: [found.times_ns[name] for name in layout.names]),
         log_times=_table(sets, placed, lambda found: [found.images[name] for name in layout.names]),
         poses=None if poses is None else np.array([poses[i] for i in placed]).reshape(-1, len(layout.names), 4, 4),
         thumbnails=np.stack(thumbnails) if motion is None else None,
@@ -146,7 +149,9 @@ def _collect(
 
 def _with_log_times(found: SurroundSet[RecordedImage]) -> SurroundSet[int]:
     images = {name: image.log_time for name, image in found.images.items()}
-    return SurroundSet(found.sequence, found.anchor, found.stamp_ns, found.stamps_ns, images, found.spread_ns)
+    return SurroundSet(
+        found.sequence, found.anchor, found.stamp_ns, found.stamps_ns, found.times_ns, images, found.spread_ns
+    )
 
 
 def _thumbnail(found: SurroundSet[RecordedImage], camera: str) -> NDArray[np.uint8] | None:
@@ -162,7 +167,7 @@ def _thumbnail(found: SurroundSet[RecordedImage], camera: str) -> NDArray[np.uin
 
 def _poses(motion: VehicleMotion, found: SurroundSet[int]) -> NDArray[np.float64] | None:
     try:
-        return np.stack([motion.base_pose(stamp) for stamp in found.stamps_ns.values()])
+        return np.stack([motion.base_pose(time) for time in found.times_ns.values()])
     except TransformError:
         return None
 
@@ -184,7 +189,7 @@ def _key(path: Location, matching: MatchingSettings, layout: RigLayout | None) -
 
 
 def _write(cached: Path, index: RecordingIndex, key: str) -> None:
-    arrays = {name: getattr(index, name) for name in ("stamps", "log_times", "poses", "thumbnails")}
+    arrays = {name: getattr(index, name) for name in ("stamps", "times", "log_times", "poses", "thumbnails")}
     np.savez_compressed(
         cached,
         key=np.array(key),
@@ -204,6 +209,7 @@ def _read(cached: Path, path: Location, key: str) -> RecordingIndex | None:
                 path,
                 RigLayout.model_validate_json(str(kept["layout"])),
                 kept["stamps"],
+                kept["times"],
                 kept["log_times"],
                 kept.get("poses"),
                 kept.get("thumbnails"),

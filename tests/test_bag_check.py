@@ -230,7 +230,9 @@ def test_a_camera_whose_clock_differs_is_named_with_the_offset_that_works(
     rig = yaml.safe_load(rig_file.read_text())
     next(camera for camera in rig["cameras"] if camera["name"] == "left")["stamp_offset"] = 3.2
     (tmp_path / "rig.yaml").write_text(yaml.safe_dump(rig))
-    assert check(path, "--rig", str(tmp_path / "rig.yaml"))["sets"]["values"]["sets"] == 10
+    checks = check(path, "--rig", str(tmp_path / "rig.yaml"))
+    assert checks["sets"]["values"]["sets"] == 10
+    assert checks["LiDAR"]["values"]["/lidar/points"] == check(SAMPLE)["LiDAR"]["values"]["/lidar/points"]
 
 
 def test_lost_images_are_a_warning_that_names_the_camera(check, sample):

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import recordings
 import torch
+import yaml
 from numpy.typing import NDArray
 from recordings import CAMERAS, SAMPLE, SAMPLE_MCAP
 from rosbags.highlevel import AnyReader
@@ -178,6 +179,20 @@ def test_a_part_of_a_recording_scores_as_it_does_within_the_whole(output: Path, 
         assert [row[name] for name in ("truth_points", "abs_rel", "rmse")] == [
             whole[key][name] for name in ("truth_points", "abs_rel", "rmse")
         ]
+
+
+def test_a_camera_whose_clock_is_ahead_is_scored_against_the_sweep_of_its_moment(two_sets: Path, tmp_path: Path):
+    topic = "/camera/left/image_raw/compressed"
+    shifted = recordings.restamped(recordings.sample_entries(2), topic, lambda _, stamp: stamp + 3_200_000_000)
+    (tmp_path / "ahead").mkdir()
+    ahead = recordings.write_rosbag2(tmp_path / "ahead" / "two_sets", shifted)
+    assert main(["rig", str(two_sets), "-o", str(tmp_path / "rig.yaml")]) == 0
+    rig = yaml.safe_load((tmp_path / "rig.yaml").read_text())
+    next(camera for camera in rig["cameras"] if camera["name"] == "left")["stamp_offset"] = 3.2
+    (tmp_path / "ahead.yaml").write_text(yaml.safe_dump(rig))
+    score(tmp_path / "as_it_was", two_sets, *CONSTANT, "--rig", tmp_path / "rig.yaml")
+    score(tmp_path / "out", ahead, *CONSTANT, "--rig", tmp_path / "ahead.yaml")
+    assert frames_of(tmp_path / "out") == frames_of(tmp_path / "as_it_was")
 
 
 def test_the_occlusion_filter_takes_points_away(output: Path, tmp_path: Path):

@@ -202,6 +202,8 @@ def test_whatever_comes_in_the_sets_keep_their_promises(s: Streams, seed: int, t
             assert of_camera.received == of_camera.matched + of_camera.queued + sum(of_camera.dropped.values())
         for surround_set in sets:
             corrected = [s.corrected(c, stamp) for c, stamp in surround_set.stamps_ns.items()]
+            assert [*surround_set.times_ns.values()] == corrected
+            assert surround_set.time_ns == s.corrected(surround_set.anchor, surround_set.stamp_ns)
             assert surround_set.spread_ns == max(corrected) - min(corrected) <= round(tolerance * s.period) + 1
             assert [s.arrivals[surround_set.images[c]] for c in s.cameras] == list(surround_set.stamps_ns.items())
             assert used.isdisjoint(surround_set.images.values())
@@ -508,7 +510,7 @@ def test_an_image_of_an_unknown_camera_is_refused_by_name():
 
 
 def numbered_set(sequence: int, stamp_ns: int = 0) -> SurroundSet[str]:
-    return SurroundSet(sequence, "front", stamp_ns, {}, {}, 0)
+    return SurroundSet(sequence, "front", stamp_ns, {}, {}, {}, 0)
 
 
 def test_the_newest_set_wins_and_the_replaced_one_is_counted():

@@ -9,7 +9,7 @@ from itertools import chain
 import numpy as np
 import pytest
 import torch
-from recordings import JAZZY, SAMPLE, Entry, changed, sample_entries, write_rosbag2
+from recordings import JAZZY, SAMPLE, Entry, changed, restamped, sample_entries, write_rosbag2
 
 from cvcdepth_core.checkpoint import DepthModelSpec
 from cvcdepth_core.distributed import Processes
@@ -138,6 +138,21 @@ def test_a_camera_that_fires_later_stands_further_along_the_way(index):
     in_world = index.poses[5, index.anchor] @ moved
     np.testing.assert_allclose(in_world, index.poses[5] @ fixed, atol=1e-9)
     assert np.ptp(ahead) > 0.2
+
+
+@pytest.mark.parametrize("motion", ["recorded", "network"])
+def test_a_camera_whose_clock_is_ahead_stands_where_it_was_when_it_fired(index, motion, tmp_path):
+    ahead = restamped(sample_entries(), "/camera/left/image_raw/compressed", lambda _, stamp: stamp + 3_200_000_000)
+    cameras = [
+        camera.model_copy(update={"stamp_offset": 3.2}) if camera.name == "left" else camera
+        for camera in index.layout.cameras
+    ]
+    layout = index.layout.model_copy(update={"cameras": tuple(cameras)})
+    shifted = build_index(write_rosbag2(tmp_path / "ahead", ahead), MATCHING, layout)
+    settings = EVERYTHING.model_copy(update={"exposure_motion": motion})
+    found, expected = (reader(of, settings)[3] for of in (shifted, build_index(SAMPLE, MATCHING, index.layout)))
+    for shown, there in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(shown, there)
 
 
 def test_the_network_is_told_the_delays_that_no_recorded_motion_makes_good_for(index, tmp_path):

@@ -20,7 +20,7 @@ from cvcdepth_ros.lidar import VehicleMotion, cloud_topics
 from cvcdepth_ros.messages import picture_from_message
 from cvcdepth_ros.recorded_rig import IMAGE_TYPES, collect_rig, discover_layout
 from cvcdepth_ros.rig_assembly import RigAssembler
-from cvcdepth_ros.synchronizer import SurroundSet, SurroundSynchronizer
+from cvcdepth_ros.synchronizer import NANOSECONDS, SurroundSet, SurroundSynchronizer
 from cvcdepth_ros.topic_timing import TopicTiming
 
 Status = Literal["passed", "warning", "failed", "skipped"]
@@ -126,6 +126,12 @@ class CheckContext:
     def stamps(self, camera: str) -> NDArray[np.int64]:
         """Return the stamps [M] of a camera's images, ns, sorted."""
         return np.array(sorted(image.stamp for image in self.images if image.camera == camera), dtype=np.int64)
+
+    def times(self, camera: str) -> NDArray[np.int64]:
+        """Return when a camera's images were taken [M], ns, sorted: their stamps without the camera's offset."""
+        entries = self.assembler.layout.cameras if self.assembler else ()
+        offsets = {entry.name: round(entry.stamp_offset * NANOSECONDS) for entry in entries}
+        return self.stamps(camera) - offsets[camera]
 
     def match(
         self, layout: RigLayout, tolerance: float, changed_offsets: Mapping[str, float] | None = None

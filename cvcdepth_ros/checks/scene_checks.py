@@ -124,7 +124,7 @@ def _projected(context: CheckContext, rig: Rig, topic: str, transforms: Transfor
             return {
                 camera.name: _share_inside(camera, swept.points)
                 for camera in rig.cameras
-                if (swept := lidar.at(_nearest(context.stamps(camera.name), stamp_ns(message)))) is not None
+                if (swept := lidar.at(_nearest(context.times(camera.name), stamp_ns(message)))) is not None
             }
         except TransformError as error:
             refusal = error
@@ -133,9 +133,9 @@ def _projected(context: CheckContext, rig: Rig, topic: str, transforms: Transfor
     return {}
 
 
-def _nearest(stamps: NDArray[np.int64], stamp: int) -> int:
-    """Return the nearest stamp; the given one where there are none."""
-    return int(stamps[np.argmin(abs(stamps - stamp))]) if stamps.size else stamp
+def _nearest(times: NDArray[np.int64], stamp: int) -> int:
+    """Return the time nearest to a stamp; the stamp where there are none."""
+    return int(times[np.argmin(abs(times - stamp))]) if times.size else stamp
 
 
 def _share_inside(camera: Camera, points: NDArray[np.float64]) -> float:
@@ -172,10 +172,10 @@ def check_motion(context: CheckContext) -> CheckResult:
 def _track(context: CheckContext, camera: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return times [M] (s) and positions [M, 3] (m) of the vehicle at the camera's images, where they are known."""
     times, positions = [], []
-    for stamp in np.unique(context.stamps(camera)).tolist():
+    for time in np.unique(context.times(camera)).tolist():
         try:
-            positions.append(context.motion.base_pose(stamp)[:3, 3] if context.motion else np.zeros(3))
+            positions.append(context.motion.base_pose(time)[:3, 3] if context.motion else np.zeros(3))
         except TransformError:
             continue
-        times.append(stamp / NANOSECONDS)
+        times.append(time / NANOSECONDS)
     return np.array(times), np.array(positions).reshape(-1, 3)

@@ -50,30 +50,30 @@ class RecordedTruth:
         for message in self._recording.messages(self.handlers, start, stop):
             self.handlers[message.topic](message)
 
-    def points(self, stamp: int) -> Points | None:
-        """Return what the LiDARs saw nearest to a stamp (ns), [M, 3] metres in the base frame then; None: nothing."""
+    def points(self, time: int) -> Points | None:
+        """Return what the LiDARs saw nearest to a moment (ns), [M, 3] metres in the base frame then; None: nothing."""
         try:
-            swept = self._sweeps.at(stamp) if self.topics else None
+            swept = self._sweeps.at(time) if self.topics else None
         except TransformError as error:
             self.refused.add(str(error))
             return None
         return None if swept is None else swept.points
 
-    def camera_depth(self, rig: Rig, stamps: Mapping[str, int], occlusion: OcclusionFilter | None) -> list[SparseDepth]:
+    def camera_depth(self, rig: Rig, times: Mapping[str, int], occlusion: OcclusionFilter | None) -> list[SparseDepth]:
         """Return each camera's true depth at the moment of its picture (ns), at full size; empty where unknown."""
         truth = []
         for camera in rig.cameras:
-            points = self.points(stamps[camera.name])
+            points = self.points(times[camera.name])
             found = np.empty((0, 3)) if points is None else points
             truth.append(sparse_depth(found, PinholeView.of(camera), occlusion))
         return truth
 
-    def base_poses(self, rig: Rig, stamps: Mapping[str, int]) -> list[Pose] | None:
-        """Return world_T_base [4, 4] at each camera's stamp (ns); None where the motion is not known."""
+    def base_poses(self, rig: Rig, times: Mapping[str, int]) -> list[Pose] | None:
+        """Return world_T_base [4, 4] at each camera's moment (ns); None where the motion is not known."""
         if self.motion is None:
             return None
         try:
-            return [self.motion.base_pose(stamps[name]) for name in rig.names]
+            return [self.motion.base_pose(times[name]) for name in rig.names]
         except TransformError as error:
             self.refused.add(str(error))
             return None
