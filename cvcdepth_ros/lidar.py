@@ -58,14 +58,16 @@ class VehicleMotion:
     def find(cls, recording: Recording, base_frame: str, static: TransformTree) -> VehicleMotion | None:
         """Look for the vehicle's motion, which is still to be added message by message; None where none is recorded.
 
-        The link of `/tf` that ends in the base frame, or in a frame fixed to it, comes before odometry topics.
+        The link of `/tf` that leads from elsewhere to the base frame, or to a frame fixed to it, comes before odometry
+        topics.
         """
         odometry = sorted(topic.name for topic in recording.topics.values() if topic.type == ODOMETRY_TYPE)
         for topic in (name for name in (MOVING_TRANSFORMS, *odometry) if name in recording.topics):
             for message in islice(recording.messages([topic]), _MESSAGES_TO_FIND_MOTION):
                 for parent, child in _moving_links(recording.deserialize(message)):
                     child_T_base = _fixed_pose(static, child, base_frame)
-                    if child_T_base is not None:
+                    # Where sensors' fixed links are on /tf too, both of their ends ride along with the base.
+                    if child_T_base is not None and _fixed_pose(static, parent, base_frame) is None:
                         return cls(topic, PoseTrack(parent, child), child_T_base)
         return None
 
