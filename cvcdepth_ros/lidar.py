@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cvcdepth_core.errors import ConfigError, RecordingError, TransformError
 from cvcdepth_core.poses import Pose, inverse, pose_from_quaternion
-from cvcdepth_ros.bags import Recording
+from cvcdepth_ros.bags import RecordedMessage, Recording
 from cvcdepth_ros.fixed_frames import MOVING_TRANSFORMS
 from cvcdepth_ros.messages import stamp_ns
 from cvcdepth_ros.synchronizer import NANOSECONDS
@@ -64,7 +64,7 @@ class VehicleMotion:
         odometry = sorted(topic.name for topic in recording.topics.values() if topic.type == ODOMETRY_TYPE)
         for topic in (name for name in (MOVING_TRANSFORMS, *odometry) if name in recording.topics):
             for message in islice(recording.messages([topic]), _MESSAGES_TO_FIND_MOTION):
-                for parent, child in _moving_links(recording.deserialize(message)):
+                for parent, child in _moving_links(recording, message):
                     child_T_base = _fixed_pose(static, child, base_frame)
                     # Where sensors' fixed links are on /tf too, both of their ends ride along with the base.
                     if child_T_base is not None and _fixed_pose(static, parent, base_frame) is None:
@@ -72,9 +72,12 @@ class VehicleMotion:
         return None
 
     def add(self, message: Any) -> None:
-        """Add a `tf2_msgs/TFMessage` or `nav_msgs/Odometry`; TransformError for an impossible pose."""
+        """Add a `tf2_msgs/TFMessage` or `nav_msgs/Odometry`; TransformError names the topic of an impossible pose."""
         if hasattr(message, "transforms"):
-            self._track.add_message(message)
+            try:
+                self._track.add_message(message)
+            except TransformError as error:
+                raise TransformError(f"{self.topic}: {error}") from error
             return
         p, q = message.pose.pose.position, message.pose.pose.orientation
         pose = pose_from_quaternion((p.x, p.y, p.z), (q.x, q.y, q.z, q.w), self.topic)
@@ -209,9 +212,13 @@ def _column(message: Any, content: NDArray[np.uint8], name: str, topic: str) -> 
     return column.ravel().astype(np.float64)
 
 
-def _moving_links(message: Any) -> list[tuple[str, str]]:
-    """Return parent and child of every link that a TFMessage or Odometry tells of."""
-    links = getattr(message, "transforms", [message])
+def _moving_links(recording: Recording, message: RecordedMessage) -> list[tuple[str, str]]:
+    """Return parent and child of every link that a TFMessage or Odometry tells of; none where it cannot be read."""
+    try:
+        content = recording.deserialize(message)
+    except RecordingError:
+        return []
+    links = getattr(content, "transforms", [content])
     return [(frame_name(link.header.frame_id), frame_name(link.child_frame_id)) for link in links]
 
 

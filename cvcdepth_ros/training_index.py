@@ -17,13 +17,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cvcdepth_core.errors import ImageError, RecordingError, RigError, TransformError
+from cvcdepth_core.errors import CvcDepthError, ImageError, RecordingError, RigError, TransformError
 from cvcdepth_core.rig import RigLayout
 from cvcdepth_ros.bags import Location, RecordedMessage, Recording, file_identities, open_recording
 from cvcdepth_ros.lidar import VehicleMotion
 from cvcdepth_ros.messages import picture_from_message
 from cvcdepth_ros.recorded_rig import assemble_rig, discover_rig, topics_without_images
-from cvcdepth_ros.replay import RecordedImage, SurroundReplay
+from cvcdepth_ros.replay import RecordedImage, Refusals, SurroundReplay
 from cvcdepth_ros.settings import MatchingSettings
 from cvcdepth_ros.synchronizer import SurroundSet
 
@@ -50,6 +50,8 @@ class RecordingIndex:
     """[S, h, w] small grey pictures of the anchor camera, to see motion by where none is recorded."""
     unplaced: int = 0
     """Sets left out since the recorded motion does not reach them."""
+    refused: tuple[str, ...] = ()
+    """Messages of the cameras, and of the motion, that could not be used: how many, and why the first."""
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -84,7 +86,8 @@ def build_index(path: Location, matching: MatchingSettings, rig_layout: RigLayou
         layout = _complete_layout(recording, rig_layout)
         replay = SurroundReplay(recording, layout, matching)
         motion = VehicleMotion.find(recording, layout.base_frame, replay.transforms)
-        sets, thumbnails = _collect(recording, replay, motion)
+        refused = Refusals()
+        sets, thumbnails = _collect(recording, replay, motion, refused)
         if not sets:
             raise RecordingError(f"{path}: no surround set: {replay.why_no_set()}")
     poses = None if motion is None else [_poses(motion, surround_set) for surround_set in sets]
@@ -100,6 +103,7 @@ def build_index(path: Location, matching: MatchingSettings, rig_layout: RigLayou
         poses=None if poses is None else np.array([poses[i] for i in placed]).reshape(-1, len(layout.names), 4, 4),
         thumbnails=np.stack(thumbnails) if motion is None else None,
         unplaced=len(sets) - len(placed),
+        refused=tuple(str(found) for found in (replay.unreadable, refused) if found.count),
     )
 
 
@@ -127,13 +131,19 @@ def _refuse_blind_cameras(recording: Recording) -> None:
 
 
 def _collect(
-    recording: Recording, replay: SurroundReplay, motion: VehicleMotion | None
+    recording: Recording, replay: SurroundReplay, motion: VehicleMotion | None, refused: Refusals
 ) -> tuple[list[SurroundSet[int]], list[NDArray[np.uint8]]]:
-    """Return the sets with the images' log times, and thumbnails when there is no `motion` to fill meanwhile."""
+    """Return the sets with the images' log times, and thumbnails when there is no `motion` to fill meanwhile.
+
+    Messages that tell no motion are added to `refused`.
+    """
 
     def add_motion(message: RecordedMessage) -> None:
-        if motion is not None:
-            motion.add(recording.deserialize(message))
+        try:
+            if motion is not None:
+                motion.add(recording.deserialize(message))
+        except CvcDepthError as error:
+            refused.add(str(error))
 
     handlers = {} if motion is None else {motion.topic: add_motion}
     sets, thumbnails = [], []
@@ -195,6 +205,7 @@ def _write(cached: Path, index: RecordingIndex, key: str) -> None:
         key=np.array(key),
         layout=np.array(index.layout.model_dump_json()),
         unplaced=np.array(index.unplaced),
+        refused=np.array(json.dumps(index.refused)),
         **{name: array for name, array in arrays.items() if array is not None},
     )
 
@@ -214,6 +225,7 @@ def _read(cached: Path, path: Location, key: str) -> RecordingIndex | None:
                 kept.get("poses"),
                 kept.get("thumbnails"),
                 int(kept["unplaced"]),
+                tuple(json.loads(str(kept["refused"]))),
             )
     except (OSError, ValueError, KeyError, zipfile.BadZipFile):
         return None

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`finetune`: short runs on the shipped recording, what they leave behind, the gate, and what they refuse."""
 
+import itertools
 import json
 import signal
 import subprocess
@@ -319,6 +320,21 @@ def test_too_little_motion_for_the_configuration_is_refused(config, tmp_path, ca
     error = capsys.readouterr().err
     assert "pandaset_002_excerpt: no training sample" in error
     assert "min_travel is 9" in error
+
+
+def test_a_pose_that_cannot_be_used_is_told_and_the_recording_remains(config, tmp_path, capsys):
+    numbers = itertools.count()
+
+    def lose_direction(message: Any) -> None:
+        if next(numbers) == 13:
+            message.transforms[0].transform.rotation.w = 7.0
+
+    entries = recordings.changed(recordings.sample_entries(), "/tf", lose_direction)
+    bag = recordings.write_rosbag2(tmp_path / "bag", entries)
+    assert finetune(config(recordings={"min_travel": 9}), tmp_path / "run", *CHEAP, bags=(bag,)) == 1
+    error = capsys.readouterr().err
+    assert f"warning: {bag}: 1 refused, the first: /tf: transform odom <- base_link: quaternion" in error
+    assert "bag: no training sample in 10 sets" in error
 
 
 def test_a_missing_camera_is_refused(config, tmp_path, capsys):

@@ -63,6 +63,7 @@ def prepare(source: Source, run: Path) -> Prepared:
             _refuse(path, problems)
             prepared.indexes.append(load_index(path, run / _INDEX_FOLDER, source.matching, source.layout))
             prepared.warnings += [_told(path, problem) for problem in problems]
+            prepared.warnings += [f"{path}: {refused}" for refused in prepared.indexes[-1].refused]
         except (CvcDepthError, OSError) as error:
             prepared.left_out[str(path)] = str(error)
     if not prepared.indexes:
