@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any, NamedTuple
@@ -23,6 +24,7 @@ CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
 ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
 
 _FLOAT_TYPES = {7: "f4", 8: "f8"}  # sensor_msgs/PointField.FLOAT32 and FLOAT64
+_COLOURS = {"rgb", "rgba"}
 _MESSAGES_TO_FIND_MOTION = 1000
 
 
@@ -43,6 +45,16 @@ def points_from_message(message: Any, topic: str) -> NDArray[np.float64]:
 def cloud_topics(recording: Recording) -> list[str]:
     """Return the names of all topics with point clouds, sorted."""
     return sorted(topic.name for topic in recording.topics.values() if topic.type == CLOUD_TYPE and topic.count)
+
+
+def find_lidars(recording: Recording) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the topics of the LiDARs, and those of clouds that were made of pictures, which their colours tell.
+
+    The node's own are among these: they are no truth, where a recording was made while it ran.
+    """
+    clouds = cloud_topics(recording)
+    of_cameras = tuple(topic for topic in clouds if _has_colours(recording, topic))
+    return tuple(topic for topic in clouds if topic not in of_cameras), of_cameras
 
 
 class VehicleMotion:
@@ -100,9 +112,9 @@ class LidarSweep(NamedTuple):
 
     stamp: int
     """ns."""
-    frame_id: str
+    base_T_lidar: Pose
     points: NDArray[np.float64]
-    """[M, 3] metres in that frame."""
+    """[M, 3] metres in the LiDAR's frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,15 +151,23 @@ class LidarSweeps:
         self._tolerance = round(tolerance * NANOSECONDS)
 
     def add(self, topic: str, message: Any) -> None:
-        """Take in a sweep; RecordingError, naming the topic and the field, when it cannot be read."""
+        """Take in a sweep.
+
+        Raises RecordingError, naming the topic and the field, when it cannot be read, and TransformError, naming the
+        topic and the frame, when that has no transform to the base frame.
+        """
         points = points_from_message(message, topic)
-        self._sweeps[topic].append(LidarSweep(stamp_ns(message), message.header.frame_id, points))
+        try:
+            base_T_lidar = self._static.lookup(self._base_frame, message.header.frame_id)
+        except TransformError as error:
+            raise TransformError(f"{topic}: {error}") from error
+        self._sweeps[topic].append(LidarSweep(stamp_ns(message), base_T_lidar, points))
 
     def at(self, stamp: int) -> SweptPoints | None:
         """Return each LiDAR's sweep nearest to `stamp` (ns), moved to then; None without any within the tolerance.
 
-        Add messages up to `stamp` plus the tolerance before. Raises TransformError when the LiDAR's frame has no
-        transform to the base frame, or the vehicle's motion is not known at both moments.
+        Add messages up to `stamp` plus the tolerance before. Raises TransformError when the vehicle's motion is not
+        known at both moments.
         """
         nearest = {topic: self._nearest(topic, stamp) for topic in self._sweeps}
         found = {topic: sweep for topic, sweep in nearest.items() if sweep is not None}
@@ -166,7 +186,7 @@ class LidarSweeps:
         return min(near, key=lambda sweep: abs(sweep.stamp - stamp), default=None)
 
     def _moved(self, sweep: LidarSweep, stamp: int) -> NDArray[np.float64]:
-        base_T_lidar = self._static.lookup(self._base_frame, sweep.frame_id)
+        base_T_lidar = sweep.base_T_lidar
         if self._motion is not None:
             pose = self._motion.base_pose
             base_T_lidar = inverse(pose(stamp)) @ pose(sweep.stamp) @ base_T_lidar
@@ -210,6 +230,14 @@ def _column(message: Any, content: NDArray[np.uint8], name: str, topic: str) -> 
         return np.empty(0)
     column: NDArray[np.generic] = np.ndarray(shape, dtype, content, field.offset, strides)
     return column.ravel().astype(np.float64)
+
+
+def _has_colours(recording: Recording, topic: str) -> bool:
+    """Say whether the points of the topic's first message that can be read have colours."""
+    for message in recording.messages([topic]):
+        with suppress(RecordingError):
+            return any(field.name in _COLOURS for field in recording.deserialize(message).fields)
+    return False
 
 
 def _moving_links(recording: Recording, message: RecordedMessage) -> list[tuple[str, str]]:

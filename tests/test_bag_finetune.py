@@ -380,6 +380,18 @@ def test_a_recording_that_cannot_be_used_is_left_out_by_name_beside_one_that_can
     assert "nothing was proven: no recording has a held-out part" in caught
 
 
+def test_a_lidar_that_is_named_and_not_there_is_told_before_the_first_step(config, tmp_path, capsys):
+    assert finetune(config(), tmp_path / "run", *CHEAP, "--lidar", "/roof") == 1
+    assert not (tmp_path / "run" / "last.safetensors").exists()
+    assert "LiDAR /roof: no such topic; topics of sensor_msgs/msg/PointCloud2: /lidar/points" in capsys.readouterr().err
+
+
+def test_without_lidar_on_demand_the_pictures_decide(config, tmp_path):
+    one_step = config(optimizer={"epochs": 1, "samples_per_step": 5})
+    run = Run(tmp_path / "run", one_step, finetune(one_step, tmp_path / "run", *CHEAP, "--no-lidar"))
+    assert run.result["verdict"]["basis"] == "label-free"
+
+
 def test_a_configuration_for_another_dataset_is_refused(config, tmp_path, capsys):
     assert finetune(config(dataset="ddad"), tmp_path / "run") == 1
     assert "dataset is 'ddad', finetune takes 'recording'" in capsys.readouterr().err

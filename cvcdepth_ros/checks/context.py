@@ -16,7 +16,7 @@ from cvcdepth_core.errors import ImageError, RecordingError, RigError, Transform
 from cvcdepth_core.images import Picture
 from cvcdepth_core.rig import Rig, RigLayout
 from cvcdepth_ros.bags import RecordedMessage, Recording
-from cvcdepth_ros.lidar import VehicleMotion, cloud_topics
+from cvcdepth_ros.lidar import VehicleMotion, find_lidars
 from cvcdepth_ros.messages import picture_from_message
 from cvcdepth_ros.recorded_rig import IMAGE_TYPES, collect_rig, discover_layout
 from cvcdepth_ros.rig_assembly import RigAssembler
@@ -54,7 +54,7 @@ class CheckOptions:
     base_frame: str = "base_link"
     """The vehicle's frame where no rig file names it."""
     lidar: tuple[str, ...] | None = None
-    """LiDAR topics; None for all point clouds of the recording."""
+    """LiDAR topics; None for all of the recording, see `find_lidars`."""
     start: int | None = None
     """First log time to read, ns."""
     stop: int | None = None
@@ -89,7 +89,7 @@ class CheckContext:
         """Why the cameras make no rig at all."""
         self.assembler = self._collected(rig_layout)
         """None where the cameras make no rig, or the transforms contradict each other."""
-        self.lidars = options.lidar if options.lidar is not None else tuple(cloud_topics(recording))
+        self.lidars, self.clouds_of_cameras = find_lidars(recording) if options.lidar is None else (options.lidar, ())
         self.motion = self._found_motion()
         self.motion_problem: str | None = None
         """The first impossible pose."""

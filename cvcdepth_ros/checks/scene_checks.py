@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -78,18 +81,52 @@ def check_lidar(context: CheckContext) -> CheckResult:
     if missing:
         remedy = f"name a topic with point clouds; there are {', '.join(clouds) or 'none'}"
         return CheckResult("failed", f"no sweep on {', '.join(missing)}", remedy, {"missing": missing})
+    if context.options.lidar == ():
+        return CheckResult("skipped", "no LiDAR is wanted")
     if not context.lidars:
         remedy = "without a LiDAR, `evaluate` gives the label-free scores only"
-        return CheckResult("warning", "no point cloud is recorded", remedy)
+        return _with_left_out(context, CheckResult("warning", "no LiDAR's point cloud is recorded", remedy))
     rig, assembler = context.rig, context.assembler
     if rig is None or assembler is None:
         return _NEEDS_RIG
-    try:
-        shares = {topic: _projected(context, rig, topic, assembler.transforms) for topic in context.lidars}
-    except (RecordingError, TransformError) as error:
-        remedy = "publish the LiDAR's frame on /tf_static; clouds need x, y and z as float32 or float64"
-        return CheckResult("failed", str(error), remedy)
-    return _judge_projection(shares)
+    shares, refusals = _projections(context, rig, assembler.transforms)
+    result = _judge_projection(shares) if shares else CheckResult("failed", "no sweep can be used")
+    return _with_left_out(context, _with_refusals(result, refusals))
+
+
+def _projections(
+    context: CheckContext, rig: Rig, transforms: TransformTree
+) -> tuple[dict[str, dict[str, float]], list[str]]:
+    """Return what `_projected` says of each LiDAR, and why there is nothing to say of the others."""
+    shares: dict[str, dict[str, float]] = {}
+    refusals = []
+    for topic in context.lidars:
+        try:
+            shares[topic] = _projected(context, rig, topic, transforms)
+        except (RecordingError, TransformError) as error:
+            refusals.append(str(error))
+    return shares, refusals
+
+
+def _with_refusals(result: CheckResult, refusals: Sequence[str]) -> CheckResult:
+    if not refusals:
+        return result
+    remedy = "publish the LiDAR's frame on /tf_static; clouds need x, y and z as float32 or float64"
+    return _worsened(result, "; ".join(refusals), remedy)
+
+
+def _with_left_out(context: CheckContext, result: CheckResult) -> CheckResult:
+    if not context.clouds_of_cameras:
+        return result
+    finding = f"not taken for a LiDAR's, since their points have colours: {', '.join(context.clouds_of_cameras)}"
+    return _worsened(result, finding, "name the LiDARs with --lidar, and nothing else is looked at")
+
+
+def _worsened(result: CheckResult, finding: str, remedy: str) -> CheckResult:
+    """Add to what a check found something that is no more than a warning."""
+    status: Status = "failed" if result.status == "failed" else "warning"
+    remedy = f"{result.remedy}; {remedy}" if result.remedy else remedy
+    return replace(result, status=status, finding=f"{result.finding}; {finding}", remedy=remedy)
 
 
 def _judge_projection(shares: dict[str, dict[str, float]]) -> CheckResult:

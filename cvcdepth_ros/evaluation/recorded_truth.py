@@ -13,7 +13,7 @@ from cvcdepth_core.poses import Pose
 from cvcdepth_core.rig import Rig
 from cvcdepth_core.visualization import Points
 from cvcdepth_ros.bags import RecordedMessage
-from cvcdepth_ros.lidar import CLOUD_TYPE, LidarSweeps, VehicleMotion, cloud_topics
+from cvcdepth_ros.lidar import CLOUD_TYPE, LidarSweeps, VehicleMotion, cloud_topics, find_lidars
 from cvcdepth_ros.replay import Refusals, SurroundReplay
 from cvcdepth_ros.synchronizer import NANOSECONDS
 
@@ -28,12 +28,15 @@ class RecordedTruth:
     """
 
     def __init__(self, replay: SurroundReplay, lidar: Sequence[str] | None, tolerance: float) -> None:
-        """`lidar` names the topics (None: all point clouds), `tolerance` is in seconds; see `LidarSweeps`.
+        """`lidar` names the topics (None: see `find_lidars`), `tolerance` is in seconds; see `LidarSweeps`.
 
         Raises RecordingError for a topic that is not there or carries no point clouds.
         """
         self._recording, base_frame = replay.recording, replay.layout.base_frame
-        self.topics = tuple(cloud_topics(self._recording) if lidar is None else map(self._checked, lidar))
+        self.topics, self.left_out = (
+            find_lidars(self._recording) if lidar is None else (tuple(map(self._checked, lidar)), ())
+        )
+        """The LiDARs' topics, and those with clouds that come from cameras."""
         self.motion = VehicleMotion.find(self._recording, base_frame, replay.transforms)
         self.refused = Refusals()
         """Sweeps and moments that are no use, and why."""

@@ -252,6 +252,7 @@ def _summary(evaluation: RecordingEvaluation, scoring: _Scoring) -> dict[str, An
         "anchor": replay.layout.anchor_camera,
         "seconds": (recording.end - recording.start) / NANOSECONDS,
         "lidar": list(truth.topics),
+        "clouds_of_cameras": list(truth.left_out),
         "motion": truth.motion.topic if truth.motion else None,
         "sets": {
             "scored": scoring.sets,
