@@ -189,7 +189,7 @@ class SurroundSession:
         frame_ids = {name: self._assembler.frame_id(name) or "" for name in published.rig.names}
         limits = read_parameters(self._node).cloud_limits
         self._outputs.publish(published.images, published.depth, published.rig, frame_ids, limits)
-        age = self._ros_time() - max(published.images.stamps_ns.values())
+        age = self._ros_time() - max(published.images.times_ns.values())
         self.latencies.record("age of newest image at publish (ROS time)", age / 1e9)
 
     def _watch_overlaps(self, published: PublishedSet) -> None:

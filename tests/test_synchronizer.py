@@ -509,8 +509,9 @@ def test_an_image_of_an_unknown_camera_is_refused_by_name():
 # --- mailbox --------------------------------------------------------------------------------------------------------
 
 
-def numbered_set(sequence: int, stamp_ns: int = 0) -> SurroundSet[str]:
-    return SurroundSet(sequence, "front", stamp_ns, {}, {}, {}, 0)
+def numbered_set(sequence: int, time_ns: int = 0) -> SurroundSet[str]:
+    """A set whose anchor's clock is an hour ahead, as its rig file knows."""
+    return SurroundSet(sequence, "front", time_ns + 36_000 * PERIOD, {}, {"front": time_ns}, {}, 0)
 
 
 def test_the_newest_set_wins_and_the_replaced_one_is_counted():
@@ -536,9 +537,9 @@ def test_a_set_handed_over_after_a_newer_one_is_not_stored():
 def test_a_set_older_than_the_freshness_gate_is_dropped_when_it_is_read():
     now = [10_000 * MS]
     mailbox: Mailbox[str] = Mailbox(max_age=0.5, clock=lambda: now[0])
-    mailbox.put(numbered_set(0, stamp_ns=9_500 * MS))
-    assert mailbox.get(timeout=0) == numbered_set(0, stamp_ns=9_500 * MS)
-    mailbox.put(numbered_set(1, stamp_ns=9_900 * MS))
+    mailbox.put(numbered_set(0, time_ns=9_500 * MS))
+    assert mailbox.get(timeout=0) == numbered_set(0, time_ns=9_500 * MS)
+    mailbox.put(numbered_set(1, time_ns=9_900 * MS))
     now[0] = 10_401 * MS
     assert mailbox.get(timeout=0) is None
     assert (mailbox.statistics().delivered, mailbox.statistics().stale) == (1, 1)
