@@ -23,10 +23,15 @@ _COEFFICIENT_COUNTS: dict[str, tuple[int, ...]] = {
     "rational_polynomial": (0, 8, 12, 14),
     "equidistant": (0, 4),
 }
-# Far beyond any lens, and far within what arithmetic holds: a focal length or a principal point in image sizes (a field
-# of view of half a minute of arc), and a distortion coefficient.
+# Far beyond any lens, and far within what arithmetic holds: a principal point in image sizes, an image size in focal
+# lengths, and a distortion coefficient.
 _MAX_RATIO = 1e4
 _MAX_COEFFICIENT = 1e6
+# In image sizes: a field of view of 0.6 degrees, 600 mm before a sensor of 6 mm.
+_MAX_FOCAL_LENGTH = 100
+_MAX_SIDE = 2**15 - 2  # pixels: OpenCV's remap counts in 16 bits, and refuses 32767
+# No sensor is so narrow; buffers of a given width whose height follows the image's would grow without end.
+_MAX_ASPECT = 20
 
 
 class RegionOfInterest(BaseModel):
@@ -172,6 +177,8 @@ def _size_problem(c: Calibration) -> str | None:
         return f"size {c.width}x{c.height}: the camera has no pixels"
     if c.width * c.height > MAX_PIXELS:
         return f"size {c.width}x{c.height}: more than {MAX_PIXELS} pixels"
+    if max(c.width, c.height) > _MAX_SIDE:
+        return f"size {c.width}x{c.height}: a side is longer than {_MAX_SIDE} pixels"
     return None
 
 
@@ -205,9 +212,11 @@ def _matrix_problem(c: Calibration) -> str | None:
         return f"K = {c.k} is not a camera matrix: want zeros left of the diagonal"
     if any(c.p) and not (c.p[0] > 0 and c.p[5] > 0 and c.p[10] == 1.0):
         return f"P = {c.p} is not a projection matrix: want fx > 0, fy > 0 and 1 in the corner"
+    if c.p[4] or c.p[8] or c.p[9]:
+        return f"P = {c.p} is not a projection matrix: want zeros left of the diagonal"
     lengths = (c.k[0], c.k[4], *((c.p[0], c.p[5]) if any(c.p) else ()))
     size, centre = max(c.width, c.height), max(map(abs, (c.k[1], c.k[2], c.k[5], c.p[1], c.p[2], c.p[6])))
-    if not size / _MAX_RATIO < min(lengths) <= max(lengths) < size * _MAX_RATIO or centre > size * _MAX_RATIO:
+    if not size / _MAX_RATIO < min(lengths) <= max(lengths) < size * _MAX_FOCAL_LENGTH or centre > size * _MAX_RATIO:
         return f"K = {c.k}, P = {c.p}: no lens sees an image of {c.width}x{c.height} so"
     R = c.rotation
     is_rotation = np.abs(R).max() < 2 and np.allclose(R @ R.T, np.eye(3), atol=1e-3) and np.linalg.det(R) > 0
@@ -220,6 +229,8 @@ def _region_problem(c: Calibration) -> str | None:
         return f"region of interest {c.roi.model_dump()} is not inside the sensor's {c.width}x{c.height}"
     if 0 in c.image_size:
         return f"binning {c.binning_x} x {c.binning_y} leaves an image of {c.image_size[0]}x{c.image_size[1]}"
+    if max(c.image_size) > _MAX_ASPECT * min(c.image_size):
+        return f"image of {c.image_size[0]}x{c.image_size[1]}: one side is more than {_MAX_ASPECT} times the other"
     return None
 
 

@@ -19,6 +19,8 @@ from cvcdepth_core.poses import Pose, inverse
 from cvcdepth_core.rig import Camera
 
 _NEAREST_OVERLAP = 1.0
+_LARGEST_REACH = 64
+"""Cells around a point that are searched for what hides it: work grows with the square. Wide lenses stay below it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,13 +107,16 @@ class OcclusionFilter:
 
     def visible(self, truth: SparseDepth, focal_length: float) -> NDArray[np.bool_]:
         """Return which points [M] of `truth` nothing hides; `focal_length` in its pixels."""
-        reach = math.ceil(math.radians(self.radius) * focal_length)
-        nearness = np.zeros((truth.height + 2 * reach, truth.width + 2 * reach))
-        nearness[truth.rows + reach, truth.columns + reach] = own = 1 / truth.depth
-        at = (truth.rows + reach) * nearness.shape[1] + truth.columns + reach
         hidden = np.zeros(len(truth), dtype=bool)
+        if not len(truth):
+            return ~hidden
+        radius = math.radians(self.radius) * focal_length
+        cell = math.ceil(radius / _LARGEST_REACH)  # pixels: one, or what a long lens spreads over many
+        reach = math.ceil(radius / cell)
+        own = 1 / truth.depth
+        nearness, at = _nearest_in_cells(truth, cell, reach)
         for row, column in _offsets_within(reach):
-            limit = own * (1 + self.margin) + math.hypot(row, column) / (focal_length * self.clearance)
+            limit = own * (1 + self.margin) + cell * math.hypot(row, column) / (focal_length * self.clearance)
             hidden |= nearness.ravel()[at + row * nearness.shape[1] + column] > limit
         return ~hidden
 
@@ -172,6 +177,18 @@ def downsample_ground_truth(depth: NDArray[np.float32], height: int, width: int)
     smaller = np.zeros((height, width), dtype=depth.dtype)
     smaller[rows * height // depth.shape[0], columns * width // depth.shape[1]] = depth[rows, columns]
     return smaller
+
+
+def _nearest_in_cells(truth: SparseDepth, cell: int, border: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return the largest inverse depth in each cell of `cell` x `cell` pixels, with a border of cells all around.
+
+    Also where in it, raveled, each point [M] lies.
+    """
+    rows, columns = truth.rows // cell + border, truth.columns // cell + border
+    nearness = np.zeros(((truth.height - 1) // cell + 1 + 2 * border, (truth.width - 1) // cell + 1 + 2 * border))
+    far_to_near = np.argsort(-truth.depth)  # of several points of a cell the last remains
+    nearness[rows[far_to_near], columns[far_to_near]] = 1 / truth.depth[far_to_near]
+    return nearness, rows * nearness.shape[1] + columns
 
 
 def _offsets_within(radius: int) -> Iterator[tuple[int, int]]:

@@ -127,17 +127,19 @@ class OverlapMonitor:
         self._correlations = {pair: _Trend(self._limits) for pair in directed}
         self._disagreements = {pair: _Trend(self._limits) for pair in self._pairs}
         self._sharpness = {camera: _Trend(self._limits) for camera in range(len(rig.cameras))}
+        self._trends = (*self._correlations.values(), *self._disagreements.values(), *self._sharpness.values())
         self._steps = self._schedule()
         self._steps_per_update = steps_per_update
+        self._updates_per_round = math.ceil(len(self._steps) / steps_per_update)
         self._step = 0
         self._last_stamp: int | None = None
         self._findings: tuple[Finding, ...] = ()
-        self._bad_since: dict[Quantity, dict[tuple[int, int], int]] = {"misalignment": {}, "disagreement": {}}
+        self._bad_since: dict[Quantity, dict[tuple[int, int], _Begin]] = {"misalignment": {}, "disagreement": {}}
 
     def update(self, surround: SurroundDepth, stamp_ns: int) -> None:
         """Take the next steps in one surround set. A stamp that goes back begins the recent seconds anew."""
         if self._last_stamp is not None and stamp_ns < self._last_stamp:
-            for trend in (*self._correlations.values(), *self._disagreements.values(), *self._sharpness.values()):
+            for trend in self._trends:
                 trend.forget_recent()
             self._bad_since = {"misalignment": {}, "disagreement": {}}
         self._last_stamp = stamp_ns
@@ -146,6 +148,8 @@ class OverlapMonitor:
             self._step = (self._step + 1) % len(self._steps)
             if surround.present[list(cameras)].all():
                 self._measure(quantity, cameras, surround, stamp_ns)
+        for trend in self._trends:
+            trend.age(stamp_ns, 2 * self._updates_per_round)
         self._findings = tuple(self._judged(stamp_ns))
 
     def findings(self) -> tuple[Finding, ...]:
@@ -194,14 +198,21 @@ class OverlapMonitor:
                 self._correlations[pair].add(stamp, correlation, usual)
 
     def _pair_state(self, pair: tuple[int, int]) -> PairState:
-        both = [t for way in (pair, pair[::-1]) if (t := self._correlations.get(way)) is not None and t.is_learnt]
+        both = [trend for trend in self._trends_of("misalignment", pair) if trend.is_learnt and trend.now is not None]
         difference = self._disagreements[pair]
+        now, usual = difference.now, difference.usual
         return PairState(
             _mean([_change_of_turn(trend) for trend in both]),
             _mean([float(np.hypot(*_best_turn(trend.usual))) for trend in both]),
-            math.nan if difference.now is None else float(difference.now),
-            math.nan if difference.usual is None or not difference.is_learnt else float(difference.usual),
+            math.nan if now is None else float(now),
+            math.nan if usual is None or not difference.is_learnt else float(usual),
         )
+
+    def _trends_of(self, quantity: Quantity, pair: tuple[int, int]) -> list[_Trend]:
+        """Return the pair's trends: of its correlations there is one for each direction that is judged."""
+        if quantity == "disagreement":
+            return [self._disagreements[pair]]
+        return [self._correlations[way] for way in (pair, pair[::-1]) if way in self._correlations]
 
     def _judged(self, stamp: int) -> Iterable[Finding]:
         states = {pair: self._pair_state(pair) for pair in self._pairs}
@@ -219,13 +230,11 @@ class OverlapMonitor:
     ) -> Iterable[Finding]:
         """Name the cameras all of whose judged pairs are above the limit; both of a pair that no camera explains.
 
-        One pair that has been so for long enough confirms them; another camera's pair does not.
+        One pair that is confirmed confirms them; another camera's pair does not.
         """
         judged = {pair: value for pair, value in values.items() if not math.isnan(value)}
         bad = {pair: value for pair, value in judged.items() if value > limit}
-        since = self._bad_since[quantity]
-        self._bad_since[quantity] = since = {pair: since.get(pair, stamp) for pair in bad}
-        confirmed = {p for p, begin in since.items() if stamp - begin >= self._limits.confirmation * NANOSECONDS}
+        confirmed = self._confirmed(quantity, bad, stamp)
         suspects = {c for pair in bad for c in pair if all(other in bad for other in judged if c in other)}
         while bad:
             # The camera that explains most is named first; its pairs then need no other explanation.
@@ -240,9 +249,25 @@ class OverlapMonitor:
                 yield self._finding(quantity, names, max(explained.values()), stamp)
             bad = {other: v for other, v in bad.items() if other not in explained}
 
+    def _confirmed(self, quantity: Quantity, bad: Iterable[tuple[int, int]], stamp: int) -> set[tuple[int, int]]:
+        """Return the pairs that have been bad for long enough, and were measured again since they became so."""
+        measured = {pair: sum(trend.measurements for trend in self._trends_of(quantity, pair)) for pair in bad}
+        before = self._bad_since[quantity]
+        since = {pair: before.get(pair, _Begin(stamp, count)) for pair, count in measured.items()}
+        self._bad_since[quantity] = since
+        least = self._limits.confirmation * NANOSECONDS
+        return {p for p, begin in since.items() if stamp - begin.stamp >= least and measured[p] > begin.measurements}
+
     def _finding(self, quantity: Quantity, names: tuple[str, ...], value: float, stamp: int) -> Finding:
         before = (found.since_ns for found in self._findings if (found.quantity, found.cameras) == (quantity, names))
         return Finding(quantity, names, value, next(before, stamp))
+
+
+class _Begin(NamedTuple):
+    """When a pair became bad: stamp, and how often it had been measured until then."""
+
+    stamp: int
+    measurements: int
 
 
 class _Trend:
@@ -252,6 +277,8 @@ class _Trend:
         self._limits = limits
         self._recent: deque[tuple[int, NDArray[np.float64]]] = deque()
         self._learnt = 0.0  # seconds
+        self._updates_without = 0
+        self.measurements = 0
         self.now: NDArray[np.float64] | None = None
         self.usual: NDArray[np.float64] | None = None
 
@@ -262,6 +289,8 @@ class _Trend:
 
     def add(self, stamp: int, value: NDArray[np.float64], is_usual: bool) -> None:
         """Take in one measurement; `is_usual` says whether the usual may learn from it."""
+        self.measurements += 1
+        self._updates_without = 0
         seconds = (stamp - self._recent[-1][0]) / NANOSECONDS if self._recent else 0.0
         self._recent.append((stamp, value))
         while stamp - self._recent[0][0] > self._limits.window * NANOSECONDS:
@@ -269,6 +298,13 @@ class _Trend:
         self.now = np.mean([recent for _, recent in self._recent], axis=0)
         if is_usual or not self.is_learnt:
             self._learn(value, min(seconds, self._limits.window))
+
+    def age(self, stamp: int, updates: int) -> None:
+        """Forget the recent seconds when they are over and so many updates brought no measurement: that is not now."""
+        self._updates_without += 1
+        is_over = self._recent and stamp - self._recent[-1][0] > self._limits.window * NANOSECONDS
+        if is_over and self._updates_without > updates:
+            self.forget_recent()
 
     def forget_recent(self) -> None:
         """Begin the recent seconds anew."""
@@ -391,9 +427,10 @@ def _change_of_turn(trend: _Trend) -> float:
 
     The whole course around the peak counts: where streets make it a ridge, its top wanders though nothing has moved.
     """
-    if trend.now is None or trend.usual is None or min(trend.now.max(), trend.usual.max()) < _LEAST_CORRELATION:
+    now, usual = trend.now, trend.usual
+    if now is None or usual is None or min(now.max(), usual.max()) < _LEAST_CORRELATION:
         return math.nan
-    likeness = _likeness(trend.now, trend.usual)
+    likeness = _likeness(now, usual)
     row, column = np.unravel_index(int(likeness.argmax()), likeness.shape)
     offsets = (_peak_offset(likeness[:, column], int(row)), _peak_offset(likeness[row], int(column)))
     steps = np.hypot(_SHIFTS[row] + offsets[0], _SHIFTS[column] + offsets[1])
@@ -427,9 +464,10 @@ def _excess(state: PairState, limits: MonitorLimits) -> float:
 
 
 def _difference(trend: _Trend) -> float:
-    if trend.now is None or trend.usual is None or not trend.is_learnt:
+    now, usual = trend.now, trend.usual
+    if now is None or usual is None or not trend.is_learnt:
         return math.nan
-    return float(trend.now - trend.usual)
+    return float(now - usual)
 
 
 def _mean(values: list[float]) -> float:

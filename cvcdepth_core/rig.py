@@ -7,8 +7,9 @@ A `RigLayout` is what a YAML file holds. It may leave calibrations and transform
 
 import math
 import os
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -108,6 +109,10 @@ class RigLayout(BaseModel):
         repeated = sorted({name for name in names if names.count(name) > 1})
         if repeated:
             raise ValueError(f"two cameras are called {', '.join(repeated)}")
+        for topic, count in Counter(camera.image_topic for camera in self.cameras).items():
+            if count > 1:
+                sharing = [camera.name for camera in self.cameras if camera.image_topic == topic]
+                raise ValueError(f"image_topic: {topic} is that of {' and '.join(sharing)}")
         if self.anchor is not None and self.anchor not in names:
             raise ValueError(f"anchor: no camera is called {self.anchor}; there are {', '.join(names)}")
         for camera in self.cameras:
@@ -193,6 +198,12 @@ class Rig:
         """The cameras' names, in order."""
         return [camera.name for camera in self.cameras]
 
+    def only(self, names: Collection[str]) -> "Rig":
+        """Return the rig of these of its cameras; the first of them stands in for an anchor that is left out."""
+        cameras = tuple(camera for camera in self.cameras if camera.name in names)
+        anchor = self.anchor if self.anchor in names else cameras[0].name
+        return replace(self, cameras=cameras, anchor=anchor)
+
     @cached_property
     def overlaps(self) -> tuple[Overlap, ...]:
         """Every ordered pair of cameras with any overlap, in the rig's order."""
@@ -202,13 +213,14 @@ class Rig:
 
     @cached_property
     def neighbours(self) -> dict[str, list[str]]:
-        """For each camera the cameras that share its view: those the rig file gives, else those that overlap enough.
+        """For each camera the others here that share its view: as the rig file says, else those that overlap enough.
 
         Computed neighbours are mutual: a strip that is wide enough in one of two cameras makes both neighbours.
         """
         wide = {frozenset((o.camera, o.neighbour)) for o in self.overlaps if o.angle >= MIN_NEIGHBOUR_OVERLAP_DEG}
         computed = {name: [other for other in self.names if frozenset((name, other)) in wide] for name in self.names}
-        return {name: list(self.given_neighbours.get(name, computed[name])) for name in self.names}
+        chosen = {name: self.given_neighbours.get(name, computed[name]) for name in self.names}
+        return {name: [other for other in others if other in chosen] for name, others in chosen.items()}
 
     @property
     def neighbour_indices(self) -> list[tuple[int, int]]:

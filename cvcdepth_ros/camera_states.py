@@ -4,6 +4,7 @@
 A camera's images are watched as they arrive; `CameraWatch.condition` is asked by a timer, so that silence is told too.
 """
 
+import math
 import statistics
 import threading
 import time
@@ -78,6 +79,7 @@ class CameraWatch:
         self._repeats = 0
         self._refusal = ""
         self._matched, self._matched_at = 0, 0.0
+        self._listening_since = -math.inf
         self._lock = threading.Lock()
         self.refused = 0
         """Images that could not be used."""
@@ -108,6 +110,11 @@ class CameraWatch:
             self._refusal = refusal
             self.refused += bool(refusal)
 
+    def resume_listening(self) -> None:
+        """Count silence from now on: nobody could take images until now."""
+        with self._lock:
+            self._listening_since = self._clock()
+
     @property
     def seconds_since_image(self) -> float | None:
         """Seconds since the last image came; None before the first."""
@@ -135,16 +142,19 @@ class CameraWatch:
             if self._received is None:
                 return [*found, (CameraState.WAITING_FOR_IMAGES, "no image yet")]
             patience = self._patience(self._stale_after)
-            if self._clock() - self._received > patience:
+            if self._clock() - max(self._received, self._listening_since) > patience:
                 found.append((CameraState.STALE, f"no image for more than {patience:.2g} s"))
             elif self._is_frozen():
                 found.append((CameraState.FROZEN, "the same picture or stamp again and again"))
             return found
 
-    def unmatched(self, matched: int) -> list[Trouble]:
-        """Say whether images come of which none fits a set any more, given how many have become part of one so far."""
+    def unmatched(self, matched: int, is_explained: bool = False) -> list[Trouble]:
+        """Say whether images come of which none fits a set any more, given how many have become part of one so far.
+
+        To be asked regularly; `is_explained` when there is another reason for it, which ends at that moment.
+        """
         with self._lock:
-            if self._received is None or matched != self._matched:
+            if self._received is None or matched != self._matched or is_explained:
                 self._matched, self._matched_at = matched, self._clock()
             patience = max(_UNMATCHED_SECONDS, _UNMATCHED_INTERVALS * self._interval())
             if (self._received or 0.0) - self._matched_at > patience:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the node says of itself on `/diagnostics`, in diagnostic_updater's form: `node: subject`, level, values."""
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
@@ -52,13 +53,32 @@ def camera_status(
     return status(_LEVELS.get(condition.state, WARN), f"camera {camera}", condition.text, values)
 
 
-def synchronisation_status(
-    synchroniser: SynchronizerStatistics, mailbox: MailboxStatistics, counters: Mapping[str, int]
-) -> DiagnosticStatus:
-    """How many sets were matched, and what became of them."""
-    values = {"matched": synchroniser.sets, **asdict(mailbox), **counters}
-    message = f"{synchroniser.sets} sets matched, {counters['published']} published"
-    return status(OK if synchroniser.sets else WARN, "synchronisation", message, values)
+class SynchronisationStatus:
+    """How many sets were matched, what became of them, and whether any got through since the report before."""
+
+    def __init__(self, max_age: float) -> None:
+        """`max_age` in seconds, for the text."""
+        self._max_age = max_age
+        self._before: Counter[str] = Counter()
+
+    def of(
+        self, synchroniser: SynchronizerStatistics, mailbox: MailboxStatistics, counters: Mapping[str, int]
+    ) -> DiagnosticStatus:
+        """Report what these have counted so far."""
+        values = {"matched": synchroniser.sets, **asdict(mailbox), **counters}
+        problem = self._problem(Counter(values))
+        message = f"{synchroniser.sets} sets matched, {counters['published']} published"
+        level = WARN if problem or not synchroniser.sets else OK
+        return status(level, "synchronisation", "; ".join(filter(None, (problem, message))), values)
+
+    def _problem(self, counted: Counter[str]) -> str:
+        new, self._before = counted - self._before, counted
+        if new["stale"] and not new["delivered"]:
+            age = f"max_age ({self._max_age:g} s)"
+            return f"every set is older than {age} in the node's time: do the clocks agree? see use_sim_time"
+        if new["skipped: rig not complete"] and not new["published"]:
+            return "sets are skipped: too few cameras are complete"
+        return ""
 
 
 def inference_status(

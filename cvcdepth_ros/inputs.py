@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node's subscriptions: images, camera_info and static transforms, each with what can go wrong on its topic."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -20,7 +20,7 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from cvcdepth_core.errors import ConfigError, TransformError
-from cvcdepth_core.rig import RigLayout
+from cvcdepth_core.rig import CameraEntry, RigLayout
 from cvcdepth_ros.camera_discovery import COMPRESSED_IMAGE_TYPE, IMAGE_TYPE
 from cvcdepth_ros.camera_states import CameraState, Trouble
 from cvcdepth_ros.qos import input_qos, refusing_impossible_qos
@@ -50,77 +50,103 @@ class CameraInputs:
         ConfigError names a camera_info topic that cannot be subscribed.
         """
         self._node = node
-        self._reliable = reliable
-        self._on_image = on_image
-        self._image_topics = {camera.name: camera.image_topic for camera in layout.cameras}
-        self._subscriptions: dict[str, Subscription] = {}
-        self._cameras: dict[str, str] = {}
-        self._connected: set[str] = set()
-        self._refused: dict[str, str] = {}
-        self.lost: dict[str, int] = dict.fromkeys(self._image_topics, 0)
+        self._cameras: dict[str, _CameraInput] = {}
         try:
             for camera in layout.cameras:
-                self._subscribe(camera.name, CameraInfo, camera.camera_info_topic, partial(on_camera_info, camera.name))
+                callbacks = partial(on_image, camera.name), partial(on_camera_info, camera.name)
+                self._cameras[camera.name] = _CameraInput(node, camera, reliable, *callbacks)
         except ConfigError:
             self.close()
             raise
 
+    @property
+    def lost(self) -> dict[str, int]:
+        """Messages that the middleware lost, by camera."""
+        return {name: camera.lost for name, camera in self._cameras.items()}
+
     def connect(self) -> None:
         """Subscribe the image topics that have appeared since the last call."""
         types = topic_types(self._node)
-        for camera, topic in self._image_topics.items():
-            known = [_IMAGE_CLASSES[name] for name in types.get(topic, ()) if name in _IMAGE_CLASSES]
-            if camera not in self._connected and known:
-                self._connected.add(camera)
-                try:
-                    self._subscribe(camera, known[0], topic, partial(self._on_image, camera))
-                except ConfigError as error:
-                    self._refused[camera] = str(error)
+        for camera in self._cameras.values():
+            camera.connect(types)
 
     def troubles(self) -> dict[str, list[Trouble]]:
         """Say for each camera why no image can arrive."""
         types = topic_types(self._node)
-        found = {
-            camera: self._image_troubles(camera, topic, types.get(topic, []))
-            for camera, topic in self._image_topics.items()
-        }
-        for topic, camera in self._cameras.items():
-            mismatch = self._qos_mismatch(topic)
-            if mismatch:
-                found[camera].append((CameraState.REJECTED, mismatch))
-        return found
+        return {name: camera.troubles(types) for name, camera in self._cameras.items()}
 
     def close(self) -> None:
         """Drop all subscriptions."""
-        for subscription in self._subscriptions.values():
-            self._node.destroy_subscription(subscription)
-        self._subscriptions.clear()
+        for camera in self._cameras.values():
+            camera.close()
 
-    def _image_troubles(self, camera: str, topic: str, types: list[str]) -> list[Trouble]:
+
+class _CameraInput:
+    """One camera's subscriptions."""
+
+    def __init__(
+        self,
+        node: Node,
+        camera: CameraEntry,
+        reliable: bool,
+        on_image: Callable[[Any], None],
+        on_camera_info: Callable[[Any], None],
+    ) -> None:
+        self._node = node
+        self._camera = camera
+        self._reliable = reliable
+        self._on_image = on_image
+        self._image_topic = _resolved(node, camera.image_topic)
+        self._refusal = ""
+        self.lost = 0
+        self._images: Subscription | None = None
+        self._camera_info = self._subscribe(CameraInfo, camera.camera_info_topic, on_camera_info)
+
+    def connect(self, types: Mapping[str, Sequence[str]]) -> None:
+        """Subscribe the images if their topic is there and has been tried neither with success nor without."""
+        known = [_IMAGE_CLASSES[name] for name in types.get(self._image_topic, ()) if name in _IMAGE_CLASSES]
+        if known and self._images is None and not self._refusal:
+            try:
+                self._images = self._subscribe(known[0], self._camera.image_topic, self._on_image)
+            except ConfigError as error:
+                self._refusal = str(error)
+
+    def troubles(self, types: Mapping[str, Sequence[str]]) -> list[Trouble]:
+        """Say why no image can arrive."""
+        subscriptions = filter(None, (self._camera_info, self._images))
+        mismatches = filter(None, map(self._qos_mismatch, subscriptions))
+        return [*self._image_troubles(types), *((CameraState.REJECTED, mismatch) for mismatch in mismatches)]
+
+    def close(self) -> None:
+        for subscription in filter(None, (self._camera_info, self._images)):
+            self._node.destroy_subscription(subscription)
+
+    def _image_troubles(self, types: Mapping[str, Sequence[str]]) -> list[Trouble]:
+        topic = self._image_topic
         if not self._node.count_publishers(topic):
             return [(CameraState.WAITING_FOR_IMAGES, f"no publisher on {topic}")]
-        if camera in self._refused:
-            return [(CameraState.REJECTED, self._refused[camera])]
-        if camera not in self._connected:
-            unusable = f"{topic} carries {', '.join(types)}, want {' or '.join(_IMAGE_CLASSES)}"
+        if self._refusal:
+            return [(CameraState.REJECTED, self._refusal)]
+        if self._images is None:
+            unusable = f"{topic} carries {', '.join(types.get(topic, ()))}, want {' or '.join(_IMAGE_CLASSES)}"
             return [(CameraState.REJECTED, unusable)]
         return []
 
-    def _qos_mismatch(self, topic: str) -> str:
+    def _qos_mismatch(self, subscription: Subscription) -> str:
         """Compare with every publisher's QoS in the graph: rclpy's event for it was seen not to come."""
-        own = self._subscriptions[topic].qos_profile
+        topic = subscription.topic_name
         for publisher in self._node.get_publishers_info_by_topic(topic):
-            compatibility, reason = qos_check_compatible(publisher.qos_profile, own)
+            compatibility, reason = qos_check_compatible(publisher.qos_profile, subscription.qos_profile)
             if compatibility == QoSCompatibility.ERROR:
                 return f"{topic}: QoS does not match: {reason} See the parameters reliable and qos_overrides."
         return ""
 
-    def _subscribe(self, camera: str, message_class: type, topic: str, callback: Callable[[Any], None]) -> None:
+    def _subscribe(self, message_class: type, topic: str, callback: Callable[[Any], None]) -> Subscription:
         def message_lost(event: Any) -> None:
-            self.lost[camera] += event.total_count_change
+            self.lost += event.total_count_change
 
         with refusing_impossible_qos(topic):
-            self._subscriptions[topic] = self._node.create_subscription(
+            return self._node.create_subscription(
                 message_class,
                 topic,
                 callback,
@@ -129,7 +155,14 @@ class CameraInputs:
                 event_callbacks=SubscriptionEventCallbacks(message_lost=message_lost),
                 qos_overriding_options=QoSOverridingOptions.with_default_policies(),
             )
-        self._cameras[topic] = camera
+
+
+def _resolved(node: Node, topic: str) -> str:
+    """Return the name by which the graph knows a topic: whole, and after remapping."""
+    try:
+        return str(node.resolve_topic_name(topic))
+    except RuntimeError as error:  # rclpy's RCLError, which has no public name
+        raise ConfigError(f"image_topic '{topic}': {error}") from error
 
 
 class StaticTransformInput:

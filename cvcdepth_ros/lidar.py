@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any, NamedTuple
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from cvcdepth_core.errors import ConfigError, RecordingError, TransformError
 from cvcdepth_core.poses import Pose, inverse, pose_from_quaternion
-from cvcdepth_ros.bags import Recording
+from cvcdepth_ros.bags import RecordedMessage, Recording
 from cvcdepth_ros.fixed_frames import MOVING_TRANSFORMS
 from cvcdepth_ros.messages import stamp_ns
 from cvcdepth_ros.synchronizer import NANOSECONDS
@@ -23,6 +24,7 @@ CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
 ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
 
 _FLOAT_TYPES = {7: "f4", 8: "f8"}  # sensor_msgs/PointField.FLOAT32 and FLOAT64
+_COLOURS = {"rgb", "rgba"}
 _MESSAGES_TO_FIND_MOTION = 1000
 
 
@@ -45,6 +47,16 @@ def cloud_topics(recording: Recording) -> list[str]:
     return sorted(topic.name for topic in recording.topics.values() if topic.type == CLOUD_TYPE and topic.count)
 
 
+def find_lidars(recording: Recording) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the topics of the LiDARs, and those of clouds that were made of pictures, which their colours tell.
+
+    The node's own are among these: they are no truth, where a recording was made while it ran.
+    """
+    clouds = cloud_topics(recording)
+    of_cameras = tuple(topic for topic in clouds if _has_colours(recording, topic))
+    return tuple(topic for topic in clouds if topic not in of_cameras), of_cameras
+
+
 class VehicleMotion:
     """Where the vehicle was over time: a moving link of `/tf`, or an odometry topic."""
 
@@ -58,21 +70,26 @@ class VehicleMotion:
     def find(cls, recording: Recording, base_frame: str, static: TransformTree) -> VehicleMotion | None:
         """Look for the vehicle's motion, which is still to be added message by message; None where none is recorded.
 
-        The link of `/tf` that ends in the base frame, or in a frame fixed to it, comes before odometry topics.
+        The link of `/tf` that leads from elsewhere to the base frame, or to a frame fixed to it, comes before odometry
+        topics.
         """
         odometry = sorted(topic.name for topic in recording.topics.values() if topic.type == ODOMETRY_TYPE)
         for topic in (name for name in (MOVING_TRANSFORMS, *odometry) if name in recording.topics):
             for message in islice(recording.messages([topic]), _MESSAGES_TO_FIND_MOTION):
-                for parent, child in _moving_links(recording.deserialize(message)):
+                for parent, child in _moving_links(recording, message):
                     child_T_base = _fixed_pose(static, child, base_frame)
-                    if child_T_base is not None:
+                    # Where sensors' fixed links are on /tf too, both of their ends ride along with the base.
+                    if child_T_base is not None and _fixed_pose(static, parent, base_frame) is None:
                         return cls(topic, PoseTrack(parent, child), child_T_base)
         return None
 
     def add(self, message: Any) -> None:
-        """Add a `tf2_msgs/TFMessage` or `nav_msgs/Odometry`; TransformError for an impossible pose."""
+        """Add a `tf2_msgs/TFMessage` or `nav_msgs/Odometry`; TransformError names the topic of an impossible pose."""
         if hasattr(message, "transforms"):
-            self._track.add_message(message)
+            try:
+                self._track.add_message(message)
+            except TransformError as error:
+                raise TransformError(f"{self.topic}: {error}") from error
             return
         p, q = message.pose.pose.position, message.pose.pose.orientation
         pose = pose_from_quaternion((p.x, p.y, p.z), (q.x, q.y, q.z, q.w), self.topic)
@@ -95,9 +112,9 @@ class LidarSweep(NamedTuple):
 
     stamp: int
     """ns."""
-    frame_id: str
+    base_T_lidar: Pose
     points: NDArray[np.float64]
-    """[M, 3] metres in that frame."""
+    """[M, 3] metres in the LiDAR's frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,15 +151,23 @@ class LidarSweeps:
         self._tolerance = round(tolerance * NANOSECONDS)
 
     def add(self, topic: str, message: Any) -> None:
-        """Take in a sweep; RecordingError, naming the topic and the field, when it cannot be read."""
+        """Take in a sweep.
+
+        Raises RecordingError, naming the topic and the field, when it cannot be read, and TransformError, naming the
+        topic and the frame, when that has no transform to the base frame.
+        """
         points = points_from_message(message, topic)
-        self._sweeps[topic].append(LidarSweep(stamp_ns(message), message.header.frame_id, points))
+        try:
+            base_T_lidar = self._static.lookup(self._base_frame, message.header.frame_id)
+        except TransformError as error:
+            raise TransformError(f"{topic}: {error}") from error
+        self._sweeps[topic].append(LidarSweep(stamp_ns(message), base_T_lidar, points))
 
     def at(self, stamp: int) -> SweptPoints | None:
         """Return each LiDAR's sweep nearest to `stamp` (ns), moved to then; None without any within the tolerance.
 
-        Add messages up to `stamp` plus the tolerance before. Raises TransformError when the LiDAR's frame has no
-        transform to the base frame, or the vehicle's motion is not known at both moments.
+        Add messages up to `stamp` plus the tolerance before. Raises TransformError when the vehicle's motion is not
+        known at both moments.
         """
         nearest = {topic: self._nearest(topic, stamp) for topic in self._sweeps}
         found = {topic: sweep for topic, sweep in nearest.items() if sweep is not None}
@@ -161,7 +186,7 @@ class LidarSweeps:
         return min(near, key=lambda sweep: abs(sweep.stamp - stamp), default=None)
 
     def _moved(self, sweep: LidarSweep, stamp: int) -> NDArray[np.float64]:
-        base_T_lidar = self._static.lookup(self._base_frame, sweep.frame_id)
+        base_T_lidar = sweep.base_T_lidar
         if self._motion is not None:
             pose = self._motion.base_pose
             base_T_lidar = inverse(pose(stamp)) @ pose(sweep.stamp) @ base_T_lidar
@@ -207,9 +232,21 @@ def _column(message: Any, content: NDArray[np.uint8], name: str, topic: str) -> 
     return column.ravel().astype(np.float64)
 
 
-def _moving_links(message: Any) -> list[tuple[str, str]]:
-    """Return parent and child of every link that a TFMessage or Odometry tells of."""
-    links = getattr(message, "transforms", [message])
+def _has_colours(recording: Recording, topic: str) -> bool:
+    """Say whether the points of the topic's first message that can be read have colours."""
+    for message in recording.messages([topic]):
+        with suppress(RecordingError):
+            return any(field.name in _COLOURS for field in recording.deserialize(message).fields)
+    return False
+
+
+def _moving_links(recording: Recording, message: RecordedMessage) -> list[tuple[str, str]]:
+    """Return parent and child of every link that a TFMessage or Odometry tells of; none where it cannot be read."""
+    try:
+        content = recording.deserialize(message)
+    except RecordingError:
+        return []
+    links = getattr(content, "transforms", [content])
     return [(frame_name(link.header.frame_id), frame_name(link.child_frame_id)) for link in links]
 
 

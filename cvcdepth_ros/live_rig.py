@@ -22,10 +22,11 @@ _SETTLING_SECONDS = 3.0
 class LiveRigDiscovery:
     """Watches the graph until its cameras stay the same for three seconds and each is calibrated and has a pose."""
 
-    def __init__(self, node: Node, base_frame: str) -> None:
+    def __init__(self, node: Node, base_frame: str, min_cameras: int) -> None:
         """Start listening. ConfigError where tf2_msgs is not installed: then nothing tells the cameras' poses."""
         self._node = node
         self._base_frame = base_frame
+        self._least = max(2, min_cameras)
         self._entries: tuple[CameraEntry, ...] = ()
         self._assembler: RigAssembler | None = None
         self._subscriptions: list[Subscription] = []
@@ -34,23 +35,32 @@ class LiveRigDiscovery:
         self._transforms = StaticTransformInput(node, self._tree)
         self._changed = time.monotonic()
 
-    def poll(self) -> RigLayout | None:
-        """Look at the graph once more; return the complete layout when there is one."""
+    def poll(self) -> RigAssembler | None:
+        """Look at the graph once more; return the rig's assembler when it is complete, its cameras in their order.
+
+        Its layout leaves calibrations and poses open, so that they can change later.
+        """
         self._watch_graph()
         settled = time.monotonic() - self._changed > _SETTLING_SECONDS
         if not settled or self._assembler is None or self._assembler.problems():
             return None
         try:
-            return self._assembler.completed_layout()
+            self._assembler.order_around_vehicle()
         except CvcDepthError as error:  # cameras that are each complete but together no rig
-            self._refusal = str(error)
+            self.refuse(str(error))
             return None
+        return self._assembler
+
+    def refuse(self, reason: str) -> None:
+        """Let what was found settle anew, because nothing can be done with it."""
+        self._refusal, self._changed = reason, time.monotonic()
 
     def problem(self) -> str:
         """Say what is still missing."""
-        if len(self._entries) < 2:
+        if len(self._entries) < self._least:
             names = ", ".join(entry.name for entry in self._entries) or "none"
-            return f"rig auto: waiting for at least two cameras with image and camera_info topics, found {names}"
+            want = f"at least {self._least} cameras with image and camera_info topics"
+            return f"rig auto: waiting for {want}, found {names}"
         problems = self._assembler.problems() if self._assembler else {}
         return "rig auto: " + next(iter(problems.values()), self._refusal or "waiting for the set of cameras to settle")
 
@@ -69,7 +79,7 @@ class LiveRigDiscovery:
         self._entries, self._changed = entries, time.monotonic()
         self._drop_camera_infos()
         self._assembler = None
-        if len(entries) >= 2:
+        if len(entries) >= self._least:
             self._assembler = RigAssembler(RigLayout(base_frame=self._base_frame, cameras=entries), self._tree)
             self._subscriptions = [self._subscribe(entry, self._assembler) for entry in entries]
 

@@ -34,7 +34,7 @@ class Mailbox(Generic[T]):
 
     def __init__(
         self,
-        max_age: float | None = None,  # s between the anchor's stamp and now; None: any age
+        max_age: float | None = None,  # s between the anchor's exposure and now; None: any age
         clock: Callable[[], int] = time.time_ns,  # ns, of the clock that stamped the images (ROS time in the node)
     ) -> None:
         """Raise ConfigError if max_age is not a positive number of seconds."""
@@ -76,7 +76,7 @@ class Mailbox(Generic[T]):
         """Wait for a set that is fresh; None after `timeout` seconds (None: no limit), or as soon as closed."""
         deadline = None if timeout is None else time.monotonic() + timeout
         while (surround_set := self._take(deadline)) is not None:
-            fresh = self._max_age is None or self._clock() - surround_set.stamp_ns <= self._max_age
+            fresh = self._max_age is None or self._clock() - surround_set.time_ns <= self._max_age
             with self._changed:
                 self._count("delivered" if fresh else "stale")
             if fresh:

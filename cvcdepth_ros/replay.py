@@ -41,7 +41,7 @@ class RecordedImage(NamedTuple):
 
 
 class Refusals:
-    """Images and sets that could not be used: how many, and the first hundred reasons."""
+    """Messages and sets that could not be used: how many, and the first hundred reasons."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -52,6 +52,9 @@ class Refusals:
         self.count += 1
         if len(self.reasons) < _KEPT_REASONS:
             self.reasons.append(reason)
+
+    def __str__(self) -> str:
+        return f"{self.count} refused, the first: {self.reasons[0]}" if self.count else "none refused"
 
 
 class SurroundReplay:
@@ -67,7 +70,7 @@ class SurroundReplay:
         self.recording = recording
         self.layout = layout
         self.unreadable = Refusals()
-        """Image messages whose bytes are no image message."""
+        """Images and CameraInfo whose bytes are no such message."""
         self._assembler = assemble_rig(recording, layout)
         self._rig: Rig | RigError = self._assembler.rig()
         self._tolerance = matching.tolerance
@@ -154,7 +157,12 @@ class SurroundReplay:
         return self._synchroniser.add(camera, stamp_ns(image), RecordedImage(image, message.log_time))
 
     def _add_camera_info(self, message: RecordedMessage) -> None:
-        if add_camera_info(self._assembler, message.topic, self.recording.deserialize(message)):
+        try:
+            info = self.recording.deserialize(message)
+        except RecordingError as error:
+            self.unreadable.add(str(error))
+            return
+        if add_camera_info(self._assembler, message.topic, info):
             try:
                 self._rig = self._assembler.rig()
             except RigError as error:
@@ -207,7 +215,7 @@ class DepthReplay:
         """Explain why `sets` gave none: what was refused, else what `SurroundReplay.why_no_set` says."""
         for refusals in (self.refused, self._replay.unreadable):
             if refusals.count:
-                return f"{refusals.count} refused, the first: {refusals.reasons[0]}"
+                return str(refusals)
         return self._replay.why_no_set(start, stop)
 
     def _current_surround(self) -> SurroundDepthEstimator:

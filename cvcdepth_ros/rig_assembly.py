@@ -6,6 +6,7 @@ from typing import Any
 
 from cvcdepth_core.calibration import Calibration
 from cvcdepth_core.errors import RigError, TransformError
+from cvcdepth_core.poses import Pose
 from cvcdepth_core.rig import CameraEntry, PoseEntry, Rig, RigLayout, order_around_vehicle
 from cvcdepth_ros.messages import calibration_from_message
 from cvcdepth_ros.transforms import TransformTree
@@ -25,12 +26,18 @@ class RigAssembler:
         self._refused: dict[str, str] = {}
 
     def add_camera_info(self, camera: str, message: Any) -> bool:
-        """Take over a camera's CameraInfo; return whether it says anything new.
+        """Take over a camera's CameraInfo; return whether it says anything new that the rig file leaves open.
 
         An impossible one is not raised but remembered as the camera's problem, and replaces what was known before:
         a camera that calls itself uncalibrated must not be used with yesterday's numbers.
         """
+        entry = self._entry(camera)
+        is_renamed = entry.frame_id is None and self._frame_ids.get(camera) != message.header.frame_id
         self._frame_ids[camera] = message.header.frame_id
+        is_recalibrated = entry.calibration is None and self._add_calibration(camera, message)
+        return is_renamed or is_recalibrated
+
+    def _add_calibration(self, camera: str, message: Any) -> bool:
         try:
             calibration = calibration_from_message(message, camera)
         except RigError as error:
@@ -69,15 +76,21 @@ class RigAssembler:
 
     def transform_problem(self, camera: str) -> str | None:
         """Say why the camera's pose in the base frame is not known; None when it is."""
-        entry = self._entry(camera)
         if self.frame_id(camera) is None:
-            return f"camera {camera}: no frame_id in the rig file, waiting for {entry.camera_info_topic}"
-        if entry.base_T_camera is None:
-            try:
-                self._lookup(entry)
-            except TransformError as error:
-                return f"camera {camera}: {error}"
+            topic = self._entry(camera).camera_info_topic
+            return f"camera {camera}: no frame_id in the rig file, waiting for {topic}"
+        try:
+            self.pose(camera)
+        except TransformError as error:
+            return f"camera {camera}: {error}"
         return None
+
+    def pose(self, camera: str) -> Pose:
+        """Return the camera's pose in the base frame: the rig file's, else the transforms'; TransformError for none."""
+        entry = self._entry(camera)
+        if entry.base_T_camera is not None:
+            return entry.base_T_camera.matrix(f"camera {camera}: base_T_camera")
+        return self.transforms.lookup(self.layout.base_frame, self.frame_id(camera) or "")
 
     def rig(self, cameras: Collection[str] | None = None) -> Rig:
         """Build the rig, of these cameras only where they are given.
@@ -88,43 +101,37 @@ class RigAssembler:
         for name, problem in self.problems().items():
             if name in layout.names:
                 raise RigError(problem)
-        poses = {c.name: self._lookup(c) for c in layout.cameras if c.base_T_camera is None}
-        return layout.complete(self._calibrations, poses)
+        return layout.complete(self._calibrations, {name: self.pose(name) for name in layout.names})
+
+    def order_around_vehicle(self) -> None:
+        """Put the layout's cameras in their order around the vehicle; errors as for `rig`."""
+        poses = {camera.name: camera.base_T_camera for camera in self.rig().cameras}
+        cameras = tuple(map(self._entry, order_around_vehicle(poses)))
+        self.layout = self.layout.model_copy(update={"cameras": cameras})
 
     def completed_layout(self) -> RigLayout:
         """Return the layout with everything that was collected filled in, its cameras ordered around the vehicle."""
-        rig = self.rig()
-        poses = {camera.name: camera.base_T_camera for camera in rig.cameras}
-        entries = {
-            camera.name: self._entry(camera.name).model_copy(
+        self.order_around_vehicle()
+        cameras = tuple(
+            self._entry(camera.name).model_copy(
                 update={
                     "frame_id": self.frame_id(camera.name),
                     "calibration": camera.calibration,
                     "base_T_camera": PoseEntry.from_matrix(camera.base_T_camera),
                 }
             )
-            for camera in rig.cameras
-        }
-        ordered = tuple(entries[name] for name in order_around_vehicle(poses))
-        return self.layout.model_copy(update={"cameras": ordered})
+            for camera in self.rig().cameras
+        )
+        return self.layout.model_copy(update={"cameras": cameras})
 
     def _layout_of(self, names: Collection[str]) -> RigLayout:
-        """Leave the other cameras out, also from the given neighbours; the first camera stands in for the anchor."""
-        entries = tuple(
-            entry.model_copy(update={"neighbours": tuple(n for n in entry.neighbours if n in names)})
-            if entry.neighbours
-            else entry
-            for entry in self.layout.cameras
-            if entry.name in names
-        )
+        """Leave the other cameras out; the first camera stands in for the anchor."""
+        entries = tuple(entry for entry in self.layout.cameras if entry.name in names)
         anchor = self.layout.anchor if self.layout.anchor in names else None
         return self.layout.model_copy(update={"cameras": entries, "anchor": anchor})
 
     def _entry(self, camera: str) -> CameraEntry:
         return next(entry for entry in self.layout.cameras if entry.name == camera)
-
-    def _lookup(self, entry: CameraEntry) -> Any:
-        return self.transforms.lookup(self.layout.base_frame, self.frame_id(entry.name) or "")
 
     def _problem(self, camera: str) -> str | None:
         return self.calibration_problem(camera) or self.transform_problem(camera)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the image messages of one set to depth: what the live node, the bag tool and the evaluation all go through."""
+"""From the image messages of one set to depth, for the bag tool and the evaluation, and the live node's part of it."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -53,3 +53,5 @@ def picture_or_error(message: Any, camera: str, rectifier: Rectifier, latencies:
             return rectifier(picture, camera, rectifier.reduction)
     except ImageError as error:
         return error
+    except Exception as error:  # what OpenCV raises has no end, and one image must not cost the others of its set
+        return ImageError(f"camera {camera}: {type(error).__name__}: {error}")

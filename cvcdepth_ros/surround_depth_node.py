@@ -31,6 +31,7 @@ from cvcdepth_ros.node_parameters import (
     read_parameters,
 )
 from cvcdepth_ros.process_setup import prepare_process, return_memory
+from cvcdepth_ros.rig_assembly import RigAssembler
 from cvcdepth_ros.surround_session import SurroundSession
 
 _POLL_SECONDS = 0.25
@@ -120,9 +121,10 @@ class SurroundDepthNode(ManagedNode):
 
     def _activate(self) -> None:
         if self._layout is None:
-            self._discovery = LiveRigDiscovery(self, read_parameters(self).base_frame)
+            parameters = read_parameters(self)
+            self._discovery = LiveRigDiscovery(self, parameters.base_frame, parameters.min_cameras)
         else:
-            self._start_session(self._layout)
+            self._start_session(RigAssembler(self._layout))
 
     def _deactivate(self) -> None:
         self.stop()
@@ -141,19 +143,28 @@ class SurroundDepthNode(ManagedNode):
             self.get_logger().warning(parameters.notice)
         return estimator
 
-    def _start_session(self, layout: RigLayout) -> None:
+    def _start_session(self, assembler: RigAssembler) -> None:
         if self._settings is not None and self._estimator is not None:
-            self._session = SurroundSession(self, layout, self._estimator, self._settings)
+            self._session = SurroundSession(self, assembler, self._estimator, self._settings)
             self._session.poll()
+
+    def _await_rig(self, discovery: LiveRigDiscovery) -> None:
+        assembler = discovery.poll()
+        if assembler is None:
+            return
+        try:
+            self._start_session(assembler)
+        except CvcDepthError as error:
+            self.get_logger().error(f"rig auto: {error}")
+            discovery.refuse(str(error))
+        else:
+            self.get_logger().info(f"rig auto: {', '.join(assembler.layout.names)}")
+            discovery.close()
+            self._discovery = None
 
     def _poll(self) -> None:
         if self._discovery is not None:
-            layout = self._discovery.poll()
-            if layout is not None:
-                self.get_logger().info(f"rig auto: {', '.join(layout.names)}")
-                self._discovery.close()
-                self._discovery = None
-                self._start_session(layout)
+            self._await_rig(self._discovery)
         if self._session is not None:
             self._session.poll()
             self._report(self._session.conditions())
@@ -214,11 +225,16 @@ class SurroundDepthNode(ManagedNode):
         return SetParametersResult(successful=True)
 
     def _replace_model(self, parameters: NodeParameters) -> None:
-        """Load another checkpoint beside the one that runs, and swap them between two sets; the family's errors."""
+        """Load another checkpoint beside the one that runs, and swap them between two sets; the family's errors.
+
+        Images that arrive meanwhile wait or are dropped, for this is a callback: half a second on two cores with NCNN,
+        but a minute where the network is compiled.
+        """
         parameters.check_complete()
         estimator = self._built_estimator(parameters)
-        if self._session is not None:
-            self._session.set_model(estimator)
+        session = self._session
+        if session is not None:
+            self.wait_for(lambda: session.set_model(estimator))
         self._settings, self._estimator = parameters, estimator
         return_memory()
 

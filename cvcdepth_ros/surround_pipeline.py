@@ -12,15 +12,15 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import CancelledError, Future
-from contextlib import contextmanager
+from concurrent.futures import Future, wait
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
 
-from cvcdepth_core.errors import CvcDepthError, ImageError
-from cvcdepth_core.estimator import DepthPredictor, SurroundDepth, SurroundDepthEstimator
+from cvcdepth_core.errors import CvcDepthError, EngineError, ImageError
+from cvcdepth_core.estimator import DepthPredictor, PictureSize, SurroundDepth, SurroundDepthEstimator
 from cvcdepth_core.images import Picture
-from cvcdepth_core.preprocess import Rectifier
+from cvcdepth_core.preprocess import Rectifier, SurroundPreprocessor
 from cvcdepth_core.rig import Rig
 from cvcdepth_ros.camera_states import CameraWatch
 from cvcdepth_ros.latencies import StageLatencies
@@ -40,6 +40,16 @@ class PublishedSet:
     images: SurroundSet[CameraImage]
     rig: Rig
     depth: SurroundDepth
+
+
+@dataclass(frozen=True, eq=False)
+class _Build:
+    """What became of a rig."""
+
+    surround: SurroundDepthEstimator | None
+    """For the cameras that can be used; None where those are fewer than a set needs."""
+    problems: Mapping[str, str]
+    """Why the other cameras cannot, by name."""
 
 
 class SurroundPipeline:
@@ -69,11 +79,13 @@ class SurroundPipeline:
         self._publish = publish
         self._observe = observe
         self._latencies = latencies
-        self._surround: Future[SurroundDepthEstimator] | None = None
+        self._rig: Rig | None = None
+        self._build: Future[_Build] | None = None
+        self._builds: list[Future[_Build]] = []
         self._last_built: SurroundDepthEstimator | None = None
         self._pace = _InferencePace()
-        self._warm_up = threading.Lock()
-        self._is_warm = False
+        self._warming = threading.Lock()
+        self._warm: DepthPredictor | None = None
         self._preparer = PicturePreparer(len(watches))
         self._estimates: queue.Queue[PublishedSet | None] = queue.Queue(maxsize=1)
         self.problem = ""
@@ -89,27 +101,32 @@ class SurroundPipeline:
             thread.start()
 
     @property
-    def rig_problem(self) -> str:
-        """Why the rig that was set cannot be used; empty when it can, or is not built yet."""
-        surround = self._surround
-        error = surround.exception() if surround is not None and surround.done() else None
-        return str(error) if error else ""
+    def rig_problems(self) -> Mapping[str, str]:
+        """Why cameras of the rig that was set cannot be used, by camera; empty while it is not built yet."""
+        build = self._build
+        if build is None or not build.done() or build.cancelled():
+            return {}
+        error = build.exception()
+        return dict.fromkeys(self._watches, str(error)) if error else build.result().problems
 
     def set_rig(self, rig: Rig | None) -> None:
         """Use these calibrations and cameras from now on; None: no set can be used until there is a rig again."""
-        former = self._surround
-        self._surround = None if rig is None else self._preparer.pool.submit(self._build_surround, rig, self._estimator)
-        if former is not None:
-            former.cancel()  # whoever sends new calibrations faster than maps can be built piles nothing up
+        self._rig = rig
+        build = None if rig is None else self._preparer.pool.submit(self._build_and_warm_up, rig, self._estimator)
+        self._builds = [*(running for running in self._builds if not running.done()), *([build] if build else [])]
+        self._use(build)
 
     def set_model(self, estimator: DepthPredictor) -> None:
-        """Use another network from the next set on; its maps are built here, while the former one still runs."""
+        """Use another network from the next set on; it is warmed up here, while the former one still runs.
+
+        EngineError when it cannot run: then the former one stays.
+        """
+        if self._rig is not None:
+            build: Future[_Build] = Future()
+            build.set_result(self._build_surround(self._rig, estimator))
+            self._warm_up(build.result().surround)
+            self._use(build)
         self._estimator = estimator
-        former = self._usable_surround()
-        if former is not None:
-            self._last_built = SurroundDepthEstimator(former.rig, estimator, former)
-            self._surround = Future()
-            self._surround.set_result(self._last_built)
 
     def add(self, camera: str, message: Any) -> None:
         """Take an image message in; quick, for whoever receives them all."""
@@ -128,25 +145,53 @@ class SurroundPipeline:
         deadline = time.monotonic() + _JOIN_SECONDS
         for thread in self._threads:
             thread.join(max(0.0, deadline - time.monotonic()))
-        return not any(thread.is_alive() for thread in self._threads)
+        building = [build for build in self._builds if build.running()]  # a warm-up may compile for minutes
+        wait(building, max(0.0, deadline - time.monotonic()))
+        return not any(thread.is_alive() for thread in self._threads) and all(build.done() for build in building)
+
+    def _use(self, build: Future[_Build] | None) -> None:
+        former, self._build = self._build, build
+        if former is not None:
+            former.cancel()  # whoever sends new calibrations faster than maps can be built piles nothing up
 
     def _prepare_ahead(self, image: CameraImage) -> None:
-        surround = self._surround
-        if surround is None or not surround.done() or surround.exception() or not self._wanted(image.camera):
+        build = self._build
+        if build is None or not build.done() or not self._wanted(image.camera):
             return
-        rectifier = surround.result().preprocessor.rectifiers.get(image.camera)
+        surround = _surround_of(build)
+        rectifier = surround.preprocessor.rectifiers.get(image.camera) if surround is not None else None
         # An image whose set will be replaced before the network is free need not be decoded.
         if rectifier is not None and self._pace.is_free_within(self._watches[image.camera].interval):
             self._preparer.prepare(image, rectifier)
 
-    def _build_surround(self, rig: Rig, estimator: DepthPredictor) -> SurroundDepthEstimator:
-        """Build the maps, taking over those of the cameras that have not changed; at first, warm the network up."""
-        surround = self._last_built = SurroundDepthEstimator(rig, estimator, self._last_built)
-        with self._warm_up:
-            if not self._is_warm:
+    def _build_and_warm_up(self, rig: Rig, estimator: DepthPredictor) -> _Build:
+        build = self._build_surround(rig, estimator)
+        with suppress(EngineError):  # the first set will tell
+            self._warm_up(build.surround)
+        return build
+
+    def _build_surround(self, rig: Rig, estimator: DepthPredictor) -> _Build:
+        """Build the maps, taking over those of the cameras that have not changed."""
+        problems: dict[str, str] = {}
+        try:
+            surround = SurroundDepthEstimator(rig, estimator, self._last_built)
+        except Exception:
+            problems = _camera_problems(rig, estimator.spec)
+            usable = [name for name in rig.names if name not in problems]
+            if not problems:
+                raise
+            if len(usable) < self._synchroniser.required:
+                return _Build(None, problems)
+            surround = SurroundDepthEstimator(rig.only(usable), estimator, self._last_built)
+        self._last_built = surround
+        return _Build(surround, problems)
+
+    def _warm_up(self, surround: SurroundDepthEstimator | None) -> None:
+        """Have done what an engine does but once, unless it is; EngineError when it cannot run."""
+        with self._warming:
+            if surround is not None and self._warm is not surround.estimator:
                 surround.warm_up()
-                self._is_warm = True
-        return surround
+                self._warm = surround.estimator
 
     def _estimate_sets(self) -> None:
         while not self._mailbox.closed:
@@ -181,6 +226,8 @@ class SurroundPipeline:
         rectifiers = surround.preprocessor.rectifiers
         images = {name: image for name, image in surround_set.images.items() if name in rectifiers}
         wanted = {name: image for name, image in images.items() if self._wanted(name)}
+        for name in images.keys() - wanted.keys():
+            self._watches[name].used("")  # nothing is known against an image that nobody looks at
         if not wanted:
             self.counters["skipped: no subscriber"] += 1
             return
@@ -193,12 +240,12 @@ class SurroundPipeline:
         self._estimates.put(PublishedSet(surround_set, surround.rig, depth))
 
     def _usable_surround(self) -> SurroundDepthEstimator | None:
-        while (surround := self._surround) is not None:
-            try:
-                return None if surround.exception() else surround.result()
-            except CancelledError:
-                continue  # another has taken its place
-        return None
+        """Wait for the rig that was set; None where there is none, or it cannot be used."""
+        build, surround = None, None
+        while build is not self._build:  # another may have taken its place meanwhile
+            build = self._build
+            surround = _surround_of(build) if build is not None else None
+        return surround
 
     def _pictures(
         self, wanted: Mapping[str, CameraImage], rectifiers: Mapping[str, Rectifier], cameras: int
@@ -217,6 +264,27 @@ class SurroundPipeline:
         self.counters["published"] += 1
         self.problem = ""
         self._observe(estimate)
+
+
+def _surround_of(build: Future[_Build]) -> SurroundDepthEstimator | None:
+    """Wait for the build; None for one that failed or was cancelled."""
+    try:
+        return build.result().surround
+    except Exception:  # rig_problems tells
+        return None
+
+
+def _camera_problems(rig: Rig, size: PictureSize) -> dict[str, str]:
+    """Say for each camera whose maps cannot be built why."""
+    found = {}
+    for name in rig.names:
+        try:
+            SurroundPreprocessor(rig.only([name]), size.height, size.width)
+        except CvcDepthError as error:
+            found[name] = str(error)
+        except Exception as error:
+            found[name] = f"{type(error).__name__}: {error}"
+    return found
 
 
 class _InferencePace:

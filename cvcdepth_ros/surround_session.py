@@ -11,14 +11,14 @@ from rclpy.node import Node
 from cvcdepth_core.errors import CvcDepthError
 from cvcdepth_core.estimator import DepthEstimator
 from cvcdepth_core.overlap_monitor import OverlapMonitor
-from cvcdepth_core.rig import Rig, RigLayout
+from cvcdepth_core.rig import Rig
 from cvcdepth_ros.camera_states import CameraCondition, CameraState, CameraWatch, Trouble, condition
 from cvcdepth_ros.diagnostics import (
+    SynchronisationStatus,
     camera_status,
     inference_status,
     model_status,
     overlap_status,
-    synchronisation_status,
 )
 from cvcdepth_ros.inputs import CameraInputs, StaticTransformInput
 from cvcdepth_ros.latencies import StageLatencies
@@ -39,12 +39,17 @@ class SurroundSession:
     Callbacks run on the executor's thread and only pass images on; everything heavy is the pipeline's.
     """
 
-    def __init__(self, node: Node, layout: RigLayout, estimator: DepthEstimator, parameters: NodeParameters) -> None:
-        """Subscribe, advertise and start the threads; ConfigError names a parameter that does not fit the rig."""
+    def __init__(
+        self, node: Node, assembler: RigAssembler, estimator: DepthEstimator, parameters: NodeParameters
+    ) -> None:
+        """Subscribe, advertise and start the threads; ConfigError names a parameter that does not fit the rig.
+
+        `assembler` has the rig's layout, and may have collected some of what that leaves open.
+        """
         self._node = node
         self._estimator = estimator
-        self._assembler = RigAssembler(layout)
-        self._complete: list[str] = []
+        self._assembler, layout = assembler, assembler.layout
+        self._places: dict[str, bytes] = {}
         self._synchroniser: SurroundSynchronizer[CameraImage] = SurroundSynchronizer.of_rig(
             layout, parameters.tolerance, parameters.queue_size, parameters.min_cameras
         )
@@ -53,6 +58,7 @@ class SurroundSession:
         self._overlaps: OverlapMonitor | None = None
         self._monitored_rig: Rig | None = None
         self._max_image_mb = parameters.max_image_mb
+        self._synchronisation = SynchronisationStatus(parameters.max_age)
         self._is_finished = False
         with ExitStack() as opened:
             trace = TraceFile(Path(parameters.trace).expanduser()) if parameters.trace else None
@@ -85,10 +91,12 @@ class SurroundSession:
         self._inputs.connect()
 
     def set_model(self, estimator: DepthEstimator) -> None:
-        """Use another network from the next set on."""
-        self._estimator = estimator
+        """Use another network from the next set on; EngineError when it cannot run. No image is received meanwhile."""
         self._pipeline.set_model(estimator)
+        self._estimator = estimator
         self._monitored_rig = None  # what was usual for the former network need not be for this one
+        for watch in self._watches.values():
+            watch.resume_listening()
 
     def close(self) -> bool:
         """Stop everything; False when a thread is still busy with its last set a second later."""
@@ -100,10 +108,11 @@ class SurroundSession:
         troubles = {name: self._setup_troubles(name) for name in self._watches}
         for name, found in self._inputs.troubles().items():
             troubles[name] += [*found, *self._watches[name].troubles()]
-        if not any(troubles.values()):
-            # Only where nothing else explains it: a camera that is missing leaves all others unmatched.
-            statistics = self._synchroniser.statistics().cameras
-            troubles = {name: watch.unmatched(statistics[name].matched) for name, watch in self._watches.items()}
+        statistics = self._synchroniser.statistics().cameras
+        # Cameras that are missing leave all others unmatched when those are too few for a set.
+        are_too_few = sum(not found for found in troubles.values()) < self._synchroniser.required
+        for name, watch in self._watches.items():
+            troubles[name] += watch.unmatched(statistics[name].matched, bool(troubles[name]) or are_too_few)
         return {name: condition(name, found) for name, found in troubles.items()}
 
     @property
@@ -125,7 +134,7 @@ class SurroundSession:
         ]
         return [
             *cameras,
-            synchronisation_status(statistics, mailbox, self._pipeline.counters),
+            self._synchronisation.of(statistics, mailbox, self._pipeline.counters),
             inference_status(self.latencies.summaries(), mailbox, self.problem, self._estimator.model_id),
             model_status(self._estimator),
             *([overlap_status(self._overlaps)] if self._overlaps else []),
@@ -136,7 +145,7 @@ class SurroundSession:
         assembler, states = self._assembler, CameraState
         reasons = [
             (states.REJECTED, assembler.refusal(camera)),
-            (states.REJECTED, self._pipeline.rig_problem or None),
+            (states.REJECTED, self._pipeline.rig_problems.get(camera)),
             (states.WAITING_FOR_CAMERA_INFO, assembler.calibration_problem(camera)),
             (states.WAITING_FOR_TRANSFORM, assembler.transform_problem(camera)),
         ]
@@ -158,19 +167,20 @@ class SurroundSession:
             self._rebuild()
 
     def _on_transforms(self) -> None:
-        if self._complete_cameras() != self._complete:
+        if self._complete_places() != self._places:
             self._rebuild()
 
-    def _complete_cameras(self) -> list[str]:
+    def _complete_places(self) -> dict[str, bytes]:
+        """Return where each complete camera is mounted, to be compared."""
         lacking = self._assembler.problems()
-        return [name for name in self._watches if name not in lacking]
+        return {name: self._assembler.pose(name).tobytes() for name in self._watches if name not in lacking}
 
     def _rebuild(self) -> None:
         """Have the rectification maps built anew, or forgotten while too few cameras are complete."""
-        self._complete = self._complete_cameras()
-        enough = len(self._complete) >= self._synchroniser.required
+        self._places = self._complete_places()
+        enough = len(self._places) >= self._synchroniser.required
         try:
-            self._pipeline.set_rig(self._assembler.rig(self._complete) if enough else None)
+            self._pipeline.set_rig(self._assembler.rig(self._places) if enough else None)
         except CvcDepthError as error:
             self._pipeline.set_rig(None)
             self._node.get_logger().error(str(error))
@@ -179,7 +189,7 @@ class SurroundSession:
         frame_ids = {name: self._assembler.frame_id(name) or "" for name in published.rig.names}
         limits = read_parameters(self._node).cloud_limits
         self._outputs.publish(published.images, published.depth, published.rig, frame_ids, limits)
-        age = self._ros_time() - max(published.images.stamps_ns.values())
+        age = self._ros_time() - max(published.images.times_ns.values())
         self.latencies.record("age of newest image at publish (ROS time)", age / 1e9)
 
     def _watch_overlaps(self, published: PublishedSet) -> None:

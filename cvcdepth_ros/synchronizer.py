@@ -18,9 +18,10 @@ older than those used are dropped. If not, the anchor image is dropped and the o
 
 **With missing cameras.** `min_cameras` lets sets leave that lack cameras. A camera is then no longer waited for once
 its newest image lies more than three periods behind the anchor's newest; it takes part again with its next image. The
-anchor itself is missing when so many others as a set needs are that far ahead of it; the first camera that is not
-stands in until it returns. Of images that are farther apart than the tolerance, those farthest from the anchor stay
-behind.
+anchor itself is missing when so many others as a set needs are that far ahead of it, and of no use when most cameras,
+all of which send images, lie that far behind it: then its clock is wrong. The first camera of which neither is true
+stands in until the anchor returns. Of images that are farther apart than the tolerance, those farthest from the anchor
+stay behind.
 
 **When.** As soon as waiting cannot bring a nearer image: every camera has sent one at or after the anchor's stamp, or
 its period (median of the last intervals) says that its next will not be nearer than the best one queued. Likewise an
@@ -35,14 +36,14 @@ queue is bounded: a dead camera only means that the others drop their oldest ima
 queued or dropped for a reason.
 
 Choose an anchor that is not faster than the other cameras. Sets come in strictly increasing anchor time, and every
-camera's images too, except across a clock step, `reset` or `flush`.
+camera's images too, except across a clock step or `flush`.
 """
 
 import math
 import threading
 from bisect import insort
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Generic, TypeVar
 
@@ -67,8 +68,14 @@ class SurroundSet(Generic[T]):
     anchor: str  # the camera around whose image the set was made
     stamp_ns: int  # the anchor image's own stamp: the stamp of everything computed from the set
     stamps_ns: dict[str, int]  # each image's own stamp, its camera's offset not subtracted
+    times_ns: dict[str, int]  # its offset subtracted: when the image was taken, by the clock of poses and LiDAR
     images: dict[str, T]
     spread_ns: int  # latest minus earliest corrected stamp
+
+    @property
+    def time_ns(self) -> int:
+        """When the anchor's image was taken."""
+        return self.times_ns[self.anchor]
 
 
 @dataclass(frozen=True)
@@ -79,7 +86,7 @@ class CameraStatistics:
     matched: int
     queued: int
     # reason -> images: unmatched (passed over), duplicate_stamp, out_of_order (too late to be used), queue_full,
-    # clock_jump (queued when the clock stepped back), reset
+    # clock_jump (queued when the clock stepped back)
     dropped: dict[str, int]
     clock_steps: int  # how often the stamps stepped back
     period_ns: int | None  # None until two images have come
@@ -131,6 +138,7 @@ class SurroundSynchronizer(Generic[T]):
         self._acting_anchor = anchor
         self._last_stamp: int | None = None  # the acting anchor's corrected one of the last set
         self._sets = 0
+        self._arrivals = 0
         self._lock = threading.Lock()
 
     @classmethod
@@ -150,29 +158,22 @@ class SurroundSynchronizer(Generic[T]):
         if stream is None:
             raise ConfigError(f"camera: {camera!r} is not one of {', '.join(self._streams)}")
         with self._lock:
-            stream.accept(stamp_ns - stream.offset, image)
+            self._arrivals += 1
+            stream.accept(stamp_ns - stream.offset, image, self._arrivals)
             return self._decide(final=False)
 
     def flush(self) -> list[SurroundSet[T]]:
         """At the end of a recording: decide with what is queued, return the last sets, and start anew."""
         with self._lock:
             sets = self._decide(final=True)
-            self._clear("unmatched")
+            for stream in self._streams.values():
+                stream.clear("unmatched")
             return sets
-
-    def reset(self) -> None:
-        """Drop everything queued and forget the stamps seen; counters and periods stay."""
-        with self._lock:
-            self._clear("reset")
 
     def statistics(self) -> SynchronizerStatistics:
         """Snapshot of the counters."""
         with self._lock:
             return SynchronizerStatistics(self._sets, {name: s.statistics() for name, s in self._streams.items()})
-
-    def _clear(self, reason: str) -> None:
-        for stream in self._streams.values():
-            stream.clear(reason)
 
     def _decide(self, *, final: bool) -> list[SurroundSet[T]]:
         sets: list[SurroundSet[T]] = []
@@ -196,19 +197,30 @@ class SurroundSynchronizer(Generic[T]):
 
     def _appoint_anchor(self) -> None:
         """Let another camera stand in for an anchor that is missing, and the anchor return when it is there."""
+        if self.required == len(self._streams):
+            return
         candidates = (self._anchor, *self._streams)
-        acting = next((name for name in candidates if not self._is_left_behind(name)), self._acting_anchor)
+        ahead = {name for name in self._streams if self._is_ahead(name)}
+        acting = next(
+            (name for name in candidates if name not in ahead and not self._is_left_behind(name, ahead)),
+            self._acting_anchor,
+        )
         if acting != self._acting_anchor:
             self._acting_anchor = acting
             if self._last_stamp is not None:
                 self._streams[acting].drop_before(self._last_stamp + 1)  # sets come in increasing time
 
-    def _is_left_behind(self, camera: str) -> bool:
-        """Whether enough others for a set have gone on without this camera."""
-        if self.required == len(self._streams):
-            return False
+    def _is_ahead(self, camera: str) -> bool:
+        """Whether most cameras send images whose stamps lie so far behind this one's that its clock must be wrong."""
         stream = self._streams[camera]
-        return sum(_is_missing(stream, other) for other in self._streams.values()) >= self.required
+        behind = [s for s in self._streams.values() if _is_missing(s, stream) and s.has_sent_since(stream)]
+        return 2 * len(behind) > len(self._streams)
+
+    def _is_left_behind(self, camera: str, ahead: Collection[str]) -> bool:
+        """Whether enough others for a set have gone on without this camera, not counting those with a wrong clock."""
+        stream = self._streams[camera]
+        others = (other for name, other in self._streams.items() if name not in ahead)
+        return sum(_is_missing(stream, other) for other in others) >= self.required
 
     def _is_worth_waiting(self, stream: "_Stream[T]", anchor: int, stamp: int | None) -> bool:
         """Whether a nearer image of this camera, or one that says where the queued one belongs, may still come."""
@@ -239,6 +251,7 @@ class SurroundSynchronizer(Generic[T]):
             anchor=self._acting_anchor,
             stamp_ns=anchor + self._streams[self._acting_anchor].offset,
             stamps_ns={name: stamp + self._streams[name].offset for name, stamp in chosen.items()},
+            times_ns=dict(chosen),
             images={name: self._streams[name].take(stamp) for name, stamp in chosen.items()},
             spread_ns=max(chosen.values()) - min(chosen.values()),
         )
@@ -265,14 +278,16 @@ class _Stream(Generic[T]):
         self._floor: int | None = None  # latest stamp that left the queue: nothing up to it can be used any more
         self._behind: list[int] = []  # the stamps that arrived last, while they ascend and are older than the newest
         self._intervals: deque[int] = deque(maxlen=_INTERVALS_FOR_PERIOD)
+        self._arrivals: deque[int] = deque(maxlen=_PATIENCE_PERIODS)  # numbers, counted over all cameras
         self._queue_size = queue_size
         self._clock_jump = clock_jump
         self._received = self._matched = self._missed = self._clock_steps = 0
         self._dropped: Counter[str] = Counter()
 
-    def accept(self, stamp: int, image: T) -> None:
-        """Queue the image, or count why not."""
+    def accept(self, stamp: int, image: T, arrival: int) -> None:
+        """Queue the image, or count why not; `arrival` counts the images of all cameras."""
         self._received += 1
+        self._arrivals.append(arrival)
         if self._steps_back(stamp):
             self._clock_steps += 1
             self.clear("clock_jump")
@@ -306,6 +321,10 @@ class _Stream(Generic[T]):
         if stamp is None or self.period is None:
             return True
         return _distance(self.newest + self.period, anchor) < _distance(stamp, anchor)
+
+    def has_sent_since(self, other: "_Stream[T]") -> bool:
+        """Whether an image has come since the other camera's last few: what sends nothing has no wrong clock."""
+        return bool(self._arrivals and other._arrivals) and self._arrivals[-1] > other._arrivals[0]
 
     def take(self, stamp: int) -> T:
         """Remove a queued image for a set; the older ones are passed over."""

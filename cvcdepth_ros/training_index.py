@@ -20,13 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvcdepth_core.atomic_file import write_atomically
-from cvcdepth_core.errors import ImageError, RecordingError, RigError, TransformError
+from cvcdepth_core.errors import CvcDepthError, ImageError, RecordingError, RigError, TransformError
 from cvcdepth_core.rig import RigLayout
 from cvcdepth_ros.bags import Location, RecordedMessage, Recording, file_identities, open_recording
 from cvcdepth_ros.lidar import VehicleMotion
 from cvcdepth_ros.messages import picture_from_message
 from cvcdepth_ros.recorded_rig import assemble_rig, discover_rig, topics_without_images
-from cvcdepth_ros.replay import RecordedImage, SurroundReplay
+from cvcdepth_ros.replay import RecordedImage, Refusals, SurroundReplay
 from cvcdepth_ros.settings import MatchingSettings
 from cvcdepth_ros.synchronizer import SurroundSet
 
@@ -42,7 +42,9 @@ class RecordingIndex:
     layout: RigLayout
     """The rig, complete."""
     stamps: NDArray[np.int64]
-    """[S, N] each image's own stamp, ns."""
+    """[S, N] each image's own stamp, ns: by which its message is told from others."""
+    times: NDArray[np.int64]
+    """[S, N] when each image was taken, ns: its stamp without its camera's offset."""
     log_times: NDArray[np.int64]
     """[S, N] when each image was recorded, ns: where it is found again."""
     poses: NDArray[np.float64] | None
@@ -52,7 +54,7 @@ class RecordingIndex:
     unplaced: int = 0
     """Sets left out since the recorded motion does not reach them."""
     unread: tuple[str, ...] = ()
-    """What of the recording could not be read, in words."""
+    """What of the recording could not be read or used, in words."""
 
     @property
     def losses(self) -> list[str]:
@@ -93,10 +95,11 @@ def build_index(path: Location, matching: MatchingSettings, rig_layout: RigLayou
         layout = _complete_layout(recording, rig_layout)
         replay = SurroundReplay(recording, layout, matching)
         motion = VehicleMotion.find(recording, layout.base_frame, replay.transforms)
-        sets, thumbnails = _collect(recording, replay, motion)
+        refused = Refusals()
+        sets, thumbnails = _collect(recording, replay, motion, refused)
         if not sets:
             raise RecordingError(f"{path}: no surround set: {replay.why_no_set()}")
-        unread = tuple(_unread(recording, replay, len(sets)))
+        unread = tuple(_unread(recording, replay, refused, len(sets)))
     poses = None if motion is None else [_poses(motion, surround_set) for surround_set in sets]
     placed = [i for i in range(len(sets)) if poses is None or poses[i] is not None]
     if not placed:
@@ -105,6 +108,7 @@ def build_index(path: Location, matching: MatchingSettings, rig_layout: RigLayou
         path=path,
         layout=layout,
         stamps=_table(sets, placed, lambda found: [found.stamps_ns[name] for name in layout.names]),
+        times=_table(sets, placed, lambda found: [found.times_ns[name] for name in layout.names]),
         log_times=_table(sets, placed, lambda found: [found.images[name] for name in layout.names]),
         poses=None if poses is None else np.array([poses[i] for i in placed]).reshape(-1, len(layout.names), 4, 4),
         thumbnails=np.stack(thumbnails) if motion is None else None,
@@ -113,12 +117,11 @@ def build_index(path: Location, matching: MatchingSettings, rig_layout: RigLayou
     )
 
 
-def _unread(recording: Recording, replay: SurroundReplay, sets: int) -> Iterator[str]:
-    """Say what of a recording that was read to its end, and gave so many sets, could not be read."""
+def _unread(recording: Recording, replay: SurroundReplay, refused: Refusals, sets: int) -> Iterator[str]:
+    """Say what of a recording that was read to its end, and gave so many sets, could not be read or used."""
     if recording.damage:
         yield f"not everything could be read: {recording.damage}"
-    if replay.unreadable.count:
-        yield f"{replay.unreadable.count} images could not be read, the first: {replay.unreadable.reasons[0]}"
+    yield from (str(found) for found in (replay.unreadable, refused) if found.count)
     if undecodable := replay.statistics.sets - sets:
         yield f"{undecodable} sets are left out: no picture of camera {replay.layout.anchor_camera} could be decoded"
 
@@ -147,13 +150,19 @@ def _refuse_blind_cameras(recording: Recording) -> None:
 
 
 def _collect(
-    recording: Recording, replay: SurroundReplay, motion: VehicleMotion | None
+    recording: Recording, replay: SurroundReplay, motion: VehicleMotion | None, refused: Refusals
 ) -> tuple[list[SurroundSet[int]], list[NDArray[np.uint8]]]:
-    """Return the sets with the images' log times, and thumbnails when there is no `motion` to fill meanwhile."""
+    """Return the sets with the images' log times, and thumbnails when there is no `motion` to fill meanwhile.
+
+    Messages that tell no motion are added to `refused`.
+    """
 
     def add_motion(message: RecordedMessage) -> None:
-        if motion is not None:
-            motion.add(recording.deserialize(message))
+        try:
+            if motion is not None:
+                motion.add(recording.deserialize(message))
+        except CvcDepthError as error:
+            refused.add(str(error))
 
     handlers = {} if motion is None else {motion.topic: add_motion}
     sets, thumbnails = [], []
@@ -169,7 +178,9 @@ def _collect(
 
 def _with_log_times(found: SurroundSet[RecordedImage]) -> SurroundSet[int]:
     images = {name: image.log_time for name, image in found.images.items()}
-    return SurroundSet(found.sequence, found.anchor, found.stamp_ns, found.stamps_ns, images, found.spread_ns)
+    return SurroundSet(
+        found.sequence, found.anchor, found.stamp_ns, found.stamps_ns, found.times_ns, images, found.spread_ns
+    )
 
 
 def _thumbnail(found: SurroundSet[RecordedImage], camera: str) -> NDArray[np.uint8] | None:
@@ -185,7 +196,7 @@ def _thumbnail(found: SurroundSet[RecordedImage], camera: str) -> NDArray[np.uin
 
 def _poses(motion: VehicleMotion, found: SurroundSet[int]) -> NDArray[np.float64] | None:
     try:
-        return np.stack([motion.base_pose(stamp) for stamp in found.stamps_ns.values()])
+        return np.stack([motion.base_pose(time) for time in found.times_ns.values()])
     except TransformError:
         return None
 
@@ -207,7 +218,7 @@ def _key(path: Location, matching: MatchingSettings, layout: RigLayout | None) -
 
 
 def _write(cached: Path, index: RecordingIndex, key: str) -> None:
-    arrays = {name: getattr(index, name) for name in ("stamps", "log_times", "poses", "thumbnails")}
+    arrays = {name: getattr(index, name) for name in ("stamps", "times", "log_times", "poses", "thumbnails")}
     content = io.BytesIO()
     np.savez_compressed(
         content,
@@ -230,6 +241,7 @@ def _read(cached: Path, path: Location, key: str) -> RecordingIndex | None:
                 path,
                 RigLayout.model_validate_json(str(kept["layout"])),
                 kept["stamps"],
+                kept["times"],
                 kept["log_times"],
                 kept.get("poses"),
                 kept.get("thumbnails"),

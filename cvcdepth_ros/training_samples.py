@@ -283,10 +283,10 @@ class SampleReader(Dataset[ReadSample | None]):
     def exposures(self, sample: Sample) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the delays [N] that the pose network's motion has to make good for, and the contexts' times [2], s."""
         index = self._indexes[sample.recording]
-        stamps = (index.stamps - index.stamps[sample.target, index.anchor]) / NANOSECONDS
+        times = (index.times - index.times[sample.target, index.anchor]) / NANOSECONDS
         by_network = self._exposure_motion == "network" or (self._exposure_motion == "auto" and index.poses is None)
-        delays = stamps[sample.target] if by_network else np.zeros(len(stamps[0]))
-        return delays, stamps[[sample.before, sample.after], index.anchor]
+        delays = times[sample.target] if by_network else np.zeros(len(times[0]))
+        return delays, times[[sample.before, sample.after], index.anchor]
 
     def _rectified(self, recording: int, row: int) -> Iterator[Picture]:
         messages = self._messages(recording, row)

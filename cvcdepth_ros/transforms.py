@@ -162,9 +162,11 @@ class PoseTrack:
 
     def add_message(self, message: Any) -> None:
         """Add the transforms of a `tf2_msgs/TFMessage` that are of this link; the others are passed over."""
-        for stamp, parent, child, parent_T_child in links_of(message):
+        for transform in message.transforms:
+            parent, child = frame_name(transform.header.frame_id), frame_name(transform.child_frame_id)
             if (parent, child) == (self.parent, self.child):
-                self.add(stamp, parent_T_child)
+                link = link_of(transform)
+                self.add(link.stamp, link.parent_T_child)
 
     def lookup(self, stamp: int) -> Pose:
         """Return parent_T_child [4, 4] at a stamp (ns): translation interpolated linearly, rotation by slerp.

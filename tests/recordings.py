@@ -58,6 +58,15 @@ def sample_entries(sets: int = 10) -> list[Entry]:
     return entries
 
 
+def entries_of(path: Path) -> list[Entry]:
+    """All messages of a rosbag2 folder in time order."""
+    with Reader(path) as reader:
+        return [
+            Entry(connection.topic, connection.msgtype, log_time, bytes(cdr))
+            for connection, log_time, cdr in reader.messages()
+        ]
+
+
 def write_rosbag2(
     path: Path,
     entries: Iterable[Entry],

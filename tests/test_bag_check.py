@@ -230,7 +230,9 @@ def test_a_camera_whose_clock_differs_is_named_with_the_offset_that_works(
     rig = yaml.safe_load(rig_file.read_text())
     next(camera for camera in rig["cameras"] if camera["name"] == "left")["stamp_offset"] = 3.2
     (tmp_path / "rig.yaml").write_text(yaml.safe_dump(rig))
-    assert check(path, "--rig", str(tmp_path / "rig.yaml"))["sets"]["values"]["sets"] == 10
+    checks = check(path, "--rig", str(tmp_path / "rig.yaml"))
+    assert checks["sets"]["values"]["sets"] == 10
+    assert checks["LiDAR"]["values"]["/lidar/points"] == check(SAMPLE)["LiDAR"]["values"]["/lidar/points"]
 
 
 def test_lost_images_are_a_warning_that_names_the_camera(check, sample):
@@ -297,6 +299,26 @@ def test_a_lidar_without_transform_or_without_coordinates_fails(check, sample, t
         found = check(recordings.write_rosbag2(tmp_path / f"bag{number}", changed))["LiDAR"]
         assert found["status"] == "failed"
         assert reason in found["finding"]
+
+
+def test_a_cloud_that_is_no_truth_is_a_warning_beside_a_lidar_that_is(check, sample, tmp_path: Path):
+    def lift(message: Any) -> None:
+        message.header.frame_id = "roof"
+
+    def colour(message: Any) -> None:
+        message.fields[-1].name = "rgb"
+
+    expected = check(SAMPLE)["LiDAR"]
+    reasons = {lift: "/other/points: no transform base_link <- roof", colour: "points have colours: /other/points"}
+    for change, reason in reasons.items():
+        other = [entry._replace(topic="/other/points") for entry in sample if entry.topic == "/lidar/points"]
+        entries = sorted([*sample, *recordings.changed(other, "/other/points", change)], key=lambda e: e.log_time)
+        path = recordings.write_rosbag2(tmp_path / change.__name__, entries)
+        found = check(path)["LiDAR"]
+        assert (found["status"], found["values"]) == ("warning", expected["values"])
+        assert reason in found["finding"]
+        assert check(path, "--lidar", "/lidar/points")["LiDAR"] == expected
+    assert check(SAMPLE, "--no-lidar")["LiDAR"]["status"] == "skipped"
 
 
 def test_points_that_are_too_far_away_to_be_true_fail(check, sample):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`finetune`: short runs on the shipped recording, what they leave behind, the gate, and what they refuse."""
 
+import itertools
 import json
 import shutil
 import signal
@@ -377,6 +378,21 @@ def test_samples_that_are_too_far_apart_are_told(config, tmp_path, capsys):
     assert told in capsys.readouterr().err
 
 
+def test_a_pose_that_cannot_be_used_is_told_and_the_recording_remains(config, tmp_path, capsys):
+    numbers = itertools.count()
+
+    def lose_direction(message: Any) -> None:
+        if next(numbers) == 13:
+            message.transforms[0].transform.rotation.w = 7.0
+
+    entries = recordings.changed(recordings.sample_entries(), "/tf", lose_direction)
+    bag = recordings.write_rosbag2(tmp_path / "bag", entries)
+    assert finetune(config(recordings={"min_travel": 9}), tmp_path / "run", *CHEAP, bags=(bag,)) == 1
+    error = capsys.readouterr().err
+    assert f"warning: {bag}: 1 refused, the first: /tf: transform odom <- base_link: quaternion" in error
+    assert "bag: no training sample in 10 sets" in error
+
+
 def test_a_missing_camera_is_refused(config, tmp_path, capsys):
     entries = recordings.without(recordings.sample_entries(3), "/camera/left/image_raw/compressed")
     assert "bag: check 1, cameras: 5 found" in refusal(entries, config, tmp_path, capsys)
@@ -438,6 +454,18 @@ def test_what_a_recording_lost_is_told_and_not_counted_as_held_out(config, tmp_p
     assert lost in result["warnings"]
     assert f"; not scored: {blind}: no set: 3 refused, the first: set at " in result["verdict"]["reason"]
     assert [entry["held_out_sets"] for entry in result["recordings"]] == [3, 0]
+
+
+def test_a_lidar_that_is_named_and_not_there_is_told_before_the_first_step(config, tmp_path, capsys):
+    assert finetune(config(), tmp_path / "run", *CHEAP, "--lidar", "/roof") == 1
+    assert not (tmp_path / "run" / "last.safetensors").exists()
+    assert "LiDAR /roof: no such topic; topics of sensor_msgs/msg/PointCloud2: /lidar/points" in capsys.readouterr().err
+
+
+def test_without_lidar_on_demand_the_pictures_decide(config, tmp_path):
+    one_step = config(optimizer={"epochs": 1, "samples_per_step": 5})
+    run = Run(tmp_path / "run", one_step, finetune(one_step, tmp_path / "run", *CHEAP, "--no-lidar"))
+    assert run.result["verdict"]["basis"] == "label-free"
 
 
 def test_a_configuration_for_another_dataset_is_refused(config, tmp_path, capsys):

@@ -319,6 +319,16 @@ def test_bytes_that_are_no_image_message_cost_their_set_only(tmp_path: Path):
     assert "camera left" in result["refused"][0]
 
 
+def test_a_camera_info_that_cannot_be_read_costs_no_set_and_is_told(tmp_path: Path):
+    entries = recordings.sample_entries(3)
+    index = [i for i, e in enumerate(entries) if e.topic == "/camera/left/camera_info"][1]
+    entries[index] = entries[index]._replace(cdr=entries[index].cdr[:40])
+    result = result_of(run(recordings.write_rosbag2(tmp_path / "damaged", entries), tmp_path / "depth"))
+    assert result["sets"] == {"written": 3, "matched": 3, "incomplete": 0, "refused": 0}
+    (reason,) = result["refused"]
+    assert "/camera/left/camera_info at" in reason
+
+
 def test_sets_are_refused_by_name_while_a_camera_calls_itself_uncalibrated(rig_file: Path, tmp_path: Path):
     content = yaml.safe_load(rig_file.read_text())
     del content["cameras"][3]["calibration"]

@@ -123,3 +123,22 @@ def test_images_of_which_none_becomes_part_of_a_set_are_told_after_a_while():
     [(state, _)] = camera.watch.unmatched(10)
     assert state == CameraState.UNMATCHED
     assert camera.watch.unmatched(11) == []
+
+
+def test_images_that_another_reason_kept_out_of_sets_get_their_time_again_when_it_has_gone():
+    camera = Camera()
+    camera.send(50)
+    assert camera.watch.unmatched(0, is_explained=True) == []
+    assert camera.watch.unmatched(0) == []
+    camera.send(50)
+    assert camera.watch.unmatched(0)
+
+
+def test_silence_while_nobody_could_listen_does_not_count():
+    camera = Camera()
+    camera.send(10)
+    camera.now += 5.0
+    camera.watch.resume_listening()
+    assert camera.state == CameraState.OK
+    camera.now += 1.1
+    assert camera.state == CameraState.STALE

@@ -19,7 +19,7 @@ from cvcdepth_core.engines.guarded_engine import GuardedEngine
 from cvcdepth_core.engines.ncnn_graph import ncnn_model
 from cvcdepth_core.engines.parity import check_parity, relative_depth_error, street_like_picture
 from cvcdepth_core.engines.rewriting import RewrittenDepthNet
-from cvcdepth_core.engines.torch_engine import MixedPrecision, TorchEagerEngine, TorchEngine
+from cvcdepth_core.engines.torch_engine import MixedPrecision, PaddedBatches, TorchEagerEngine, TorchEngine
 from cvcdepth_core.errors import ConfigError, EngineError
 from cvcdepth_core.estimator import DepthEstimator
 from cvcdepth_core.networks import ENCODERS, DepthNet, disparity_to_depth
@@ -247,6 +247,37 @@ def test_a_fallback_that_fails_too_is_an_error(error: Exception):
     engine = GuardedEngine(FaultyDevice(0, error), fallback=lambda: FaultyDevice(0, error))
     with pytest.raises(EngineError, match=r"out of memory|launch failure"):
         engine.disparity(random_pictures(2))
+
+
+def test_a_compiled_network_sees_one_size_of_batch_while_cameras_come_and_go():
+    network, seen = TorchEagerEngine(lively_network("resnet18"), CPU), []
+
+    def compiled(images: Tensor) -> Tensor:
+        seen.append(len(images))
+        return network.disparity(images)
+
+    padded, images = PaddedBatches(compiled), random_images(6)
+    for count in (2, 6, 5, 1):
+        given = padded(images[:count])
+        assert len(given) == count
+        torch.testing.assert_close(given, network.disparity(images[:count]))
+    assert seen == [2, 6, 6, 6]
+
+
+def test_a_batch_that_does_not_fit_into_memory_any_more_is_not_filled_up_again():
+    fits = [6]
+
+    def compiled(images: Tensor) -> Tensor:
+        if len(images) > fits[0]:
+            raise torch.cuda.OutOfMemoryError("CUDA out of memory")
+        return images
+
+    padded, images = PaddedBatches(compiled), random_images(6)
+    padded(images)
+    fits[0] = 3
+    with pytest.raises(torch.cuda.OutOfMemoryError):
+        padded(images)
+    assert len(padded(images[:3])) == len(padded(images[3:])) == 3
 
 
 @needs_ncnn

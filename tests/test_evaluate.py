@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import recordings
 import torch
+import yaml
 from numpy.typing import NDArray
 from recordings import CAMERAS, SAMPLE, SAMPLE_MCAP
 from rosbags.highlevel import AnyReader
@@ -95,6 +96,52 @@ def depth_images(path: Path, topic: str) -> list[NDArray[np.float32]]:
 
 def stamp_of(message: Any) -> tuple[int, int]:
     return message.header.stamp.sec, message.header.stamp.nanosec
+
+
+# Whose clouds are truth
+
+
+@pytest.fixture(scope="module")
+def recorded_with_depth(two_sets: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The first two sets as `ros2 bag record -a` has them while the node runs: with its clouds of random depth."""
+    folder = tmp_path_factory.mktemp("recorded_with_depth")
+    assert main(["run", str(two_sets), "-o", str(folder / "depth"), *SMALL, "--clouds", "all"]) == 0
+    clouds = [entry for entry in recordings.entries_of(folder / "depth") if entry.topic.endswith("/points")]
+    assert len({entry.topic for entry in clouds}) == 7
+    entries = sorted([*recordings.entries_of(two_sets), *clouds], key=lambda entry: entry.log_time)
+    return recordings.write_rosbag2(folder / "two_sets", entries)
+
+
+def test_clouds_that_the_node_made_are_no_truth_unless_they_are_named(
+    recorded_with_depth: Path, two_sets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    score(tmp_path / "lidar", two_sets, *CONSTANT)
+    capsys.readouterr()
+    result = score(tmp_path / "all", recorded_with_depth, *CONSTANT)
+    assert frames_of(tmp_path / "all") == frames_of(tmp_path / "lidar")
+    own = ["/surround_depth/points", *(f"/surround_depth/{name}/points" for name in CAMERAS)]
+    assert result["recordings"][0]["lidar"] == ["/lidar/points"]
+    assert result["recordings"][0]["clouds_of_cameras"] == sorted(own)
+    assert f"not taken for a LiDAR's, since their points have colours: {sorted(own)[0]}" in capsys.readouterr().err
+    named = score(tmp_path / "named", recorded_with_depth, *CONSTANT, "--lidar", "/surround_depth/points")
+    assert named["recordings"][0]["lidar"] == ["/surround_depth/points"]
+    assert named["truth_points"] > 0
+
+
+def test_a_cloud_in_a_frame_without_a_transform_is_told_and_costs_no_other(
+    two_sets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    def lift(message: Any) -> None:
+        message.header.frame_id = "roof"
+
+    entries = recordings.entries_of(two_sets)
+    sweeps = [entry._replace(topic="/roof/points") for entry in entries if entry.topic == "/lidar/points"]
+    both = sorted([*entries, *recordings.changed(sweeps, "/roof/points", lift)], key=lambda entry: entry.log_time)
+    score(tmp_path / "one", two_sets, *CONSTANT)
+    (tmp_path / "bag").mkdir()
+    score(tmp_path / "both", recordings.write_rosbag2(tmp_path / "bag" / "two_sets", both), *CONSTANT)
+    assert frames_of(tmp_path / "both") == frames_of(tmp_path / "one")
+    assert "/roof/points: no transform base_link <- roof: frame 'roof' is unknown" in capsys.readouterr().err
 
 
 # The numbers
@@ -178,6 +225,20 @@ def test_a_part_of_a_recording_scores_as_it_does_within_the_whole(output: Path, 
         assert [row[name] for name in ("truth_points", "abs_rel", "rmse")] == [
             whole[key][name] for name in ("truth_points", "abs_rel", "rmse")
         ]
+
+
+def test_a_camera_whose_clock_is_ahead_is_scored_against_the_sweep_of_its_moment(two_sets: Path, tmp_path: Path):
+    topic = "/camera/left/image_raw/compressed"
+    shifted = recordings.restamped(recordings.sample_entries(2), topic, lambda _, stamp: stamp + 3_200_000_000)
+    (tmp_path / "ahead").mkdir()
+    ahead = recordings.write_rosbag2(tmp_path / "ahead" / "two_sets", shifted)
+    assert main(["rig", str(two_sets), "-o", str(tmp_path / "rig.yaml")]) == 0
+    rig = yaml.safe_load((tmp_path / "rig.yaml").read_text())
+    next(camera for camera in rig["cameras"] if camera["name"] == "left")["stamp_offset"] = 3.2
+    (tmp_path / "ahead.yaml").write_text(yaml.safe_dump(rig))
+    score(tmp_path / "as_it_was", two_sets, *CONSTANT, "--rig", tmp_path / "rig.yaml")
+    score(tmp_path / "out", ahead, *CONSTANT, "--rig", tmp_path / "ahead.yaml")
+    assert frames_of(tmp_path / "out") == frames_of(tmp_path / "as_it_was")
 
 
 def test_the_occlusion_filter_takes_points_away(output: Path, tmp_path: Path):

@@ -19,17 +19,18 @@ from cvcdepth_ros.recorded_rig import assemble_rig, discover_rig
 Change = Callable[[int, Any], None]
 
 
-def on_tf(path: Path, change: Change = lambda number, link: None, sets: int = 3) -> Path:
-    """The sample with all its fixed links in every message of /tf and none on /tf_static.
+def on_tf(path: Path, change: Change = lambda number, link: None, sets: int = 3, *, fixed_first: bool = False) -> Path:
+    """The sample with all its fixed links in every message of /tf, after or before the moving one, none on /tf_static.
 
     `change` is given each of these links and the number of its message.
     """
     entries = recordings.sample_entries(sets)
     (static,) = (entry for entry in entries if entry.topic == "/tf_static")
-    return recordings.write_rosbag2(path, list(_repeated(recordings.without(entries, "/tf_static"), static, change)))
+    others = recordings.without(entries, "/tf_static")
+    return recordings.write_rosbag2(path, list(_repeated(others, static, change, fixed_first)))
 
 
-def _repeated(entries: list[Entry], static: Entry, change: Change) -> Iterator[Entry]:
+def _repeated(entries: list[Entry], static: Entry, change: Change, fixed_first: bool) -> Iterator[Entry]:
     number = 0
 
     def add_fixed(message: Any) -> None:
@@ -37,7 +38,7 @@ def _repeated(entries: list[Entry], static: Entry, change: Change) -> Iterator[E
         links = JAZZY.deserialize_cdr(static.cdr, static.type).transforms
         for link in links:
             change(number, link)
-        message.transforms = [*message.transforms, *links]
+        message.transforms = [*links, *message.transforms] if fixed_first else [*message.transforms, *links]
         number += 1
 
     yield from recordings.changed(entries, "/tf", add_fixed)
@@ -99,13 +100,14 @@ def test_a_lidar_that_moves_is_no_truth_and_the_cameras_remain(tmp_path: Path, c
     assert "no transform base_link <- pandar64: /tf: base_link <- pandar64 moves during the recording" in captured.err
 
 
+@pytest.mark.parametrize("fixed_first", [False, True])
 def test_a_recording_with_all_sensors_on_tf_is_scored_as_with_tf_static(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    fixed_first: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     static = recordings.write_rosbag2(tmp_path / "static", recordings.sample_entries(3))
     options = ["--predictor", "constant", "--height", "64", "--width", "96", "--no-report", "--quiet"]
     scores = []
-    for path in (static, on_tf(tmp_path / "tf")):
+    for path in (static, on_tf(tmp_path / "tf", fixed_first=fixed_first)):
         assert main(["evaluate", str(path), *options, "-o", str(tmp_path / f"{path.name}_out")]) == 0
         scores.append(capsys.readouterr().out.splitlines()[:-1])
     assert scores[0] == scores[1]

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import math
+import time
 
 import numpy as np
 import pytest
@@ -80,6 +81,22 @@ def test_surfaces_at_a_grazing_angle_do_not_hide_themselves(surface, turned):
     truth = sparse_depth(np.stack(axes, axis=-1).reshape(-1, 3), camera)
     assert len(truth) > 200
     assert OcclusionFilter(radius=3.0).visible(truth, 100.0).all()
+
+
+def test_what_a_long_lens_spreads_over_many_pixels_is_hidden_as_soon():
+    """Two degrees over 2800 pixels: half a degree are 700 of them, a disc of a million and a half."""
+    focal_length, columns = 80_000.0, np.arange(0, 2800, 40)
+    occluder = columns < 1400
+    rows = np.where(occluder, 200, 400)
+    truth = SparseDepth(rows, columns, np.where(occluder, 50.0, 300.0), 1600, 2800)
+    begin = time.process_time()
+    visible = OcclusionFilter().visible(truth, focal_length)
+    assert time.process_time() - begin < 2.0
+    assert visible[occluder].all()
+    hidden = ~visible[~occluder]
+    distance = np.hypot(columns[~occluder] - 1360, 200)
+    assert hidden[distance < 670].all()
+    assert not hidden[distance > 730].any()
 
 
 @pytest.mark.parametrize("field", ["radius", "clearance", "margin"])

@@ -106,6 +106,32 @@ def test_a_dead_camera_is_not_judged():
     assert not monitor.findings()
 
 
+def test_what_is_not_measured_any_more_is_not_found_any_more():
+    turned_right = _drive({"right": _turn(1, 1.0)})
+    monitor, found, _ = _watch(turned_right)
+    assert any("right" in finding.cameras for finding in found)
+    for number in range(80, 140):
+        gone = replace(turned_right[number % SETS], present=np.array([True, True, False]))
+        monitor.update(gone, number * 10**8)
+    assert not any("right" in finding.cameras for finding in monitor.findings())
+    assert math.isnan(monitor.pairs()["middle", "right"].misalignment)
+
+
+def test_one_bad_measurement_does_not_confirm_itself():
+    step = 3 * 10**9  # so slowly that each measurement is the only one of its window, for longer than is confirmed
+    monitor = OverlapMonitor(RIG, LIMITS)
+    for number in range(40):
+        monitor.update(HEALTHY[number % SETS], number * step)
+    apart = [replace(s, depth=s.depth * np.float32([1.0, 1.0, 3.0])[:, None, None]) for s in HEALTHY]
+    rounds = len(monitor._steps) // monitor._steps_per_update
+    for number in range(40, 40 + rounds):
+        monitor.update(apart[number % SETS], number * step)
+        assert not monitor.findings()
+    for number in range(40 + rounds, 40 + 3 * rounds):
+        monitor.update(apart[number % SETS], number * step)
+    assert monitor.findings()
+
+
 def test_a_stamp_that_goes_back_begins_the_recent_seconds_anew():
     monitor, _, _ = _watch(HEALTHY)
     monitor.update(HEALTHY[0], 0)

@@ -49,12 +49,19 @@ def test_the_trial_tells_what_was_not_found_and_who_was_named_instead(tool: Any)
 
 def test_a_confirmed_camera_does_not_confirm_what_another_one_shows_for_a_moment(drive: Any):
     monitor = OverlapMonitor(drive.rig)
+
+    def measure() -> None:
+        for trend in monitor._trends:
+            trend.measurements += 1
+
     left, right = drive.rig.names.index("left"), drive.rig.names.index("right")
     values = dict.fromkeys(monitor._pairs, 0.0)
     values |= {pair: 1.0 for pair in values if left in pair}
     assert not list(monitor._named("misalignment", values, 0.5, 0))
+    measure()
     values |= {pair: 2.0 for pair in values if right in pair}
     named = [finding.cameras for finding in monitor._named("misalignment", values, 0.5, 10**9)]
     assert named == [("left",)]
+    measure()
     named = [finding.cameras for finding in monitor._named("misalignment", values, 0.5, 2 * 10**9)]
     assert sorted(named) == [("left",), ("right",)]

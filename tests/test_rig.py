@@ -333,6 +333,7 @@ WRONG_FILES: dict[str, tuple[object, str]] = {
     "unknown neighbour": (_content(neighbours=["a", "c"]), "camera b: neighbours: no other camera is called c"),
     "itself as neighbour": (_content(neighbours=["b"]), "camera b: neighbours: no other camera is called b"),
     "a neighbour twice": (_content(neighbours=["a", "a"]), "camera b: neighbours: a, a names one twice"),
+    "one image topic for two": (_content(image_topic="/a/image"), "image_topic: /a/image is that of a and b"),
     "unknown anchor": (_content() | {"anchor": "c"}, "anchor: no camera is called c; there are a, b"),
     "quaternion not unit": (
         _content(base_T_camera={"translation": [0, 0, 0], "rotation": [0, 0, 1, 1]}),

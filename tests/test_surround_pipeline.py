@@ -7,18 +7,21 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from recordings import CAMERAS, SAMPLE
 
 from cvcdepth_core.checkpoint import DepthModelSpec
+from cvcdepth_core.errors import EngineError, ImageError
 from cvcdepth_core.estimator import DepthEstimator, SurroundDepthEstimator
+from cvcdepth_core.preprocess import Rectifier
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.camera_states import CameraState, CameraWatch
 from cvcdepth_ros.latencies import StageLatencies
 from cvcdepth_ros.mailbox import Mailbox
 from cvcdepth_ros.recorded_rig import discover_rig
-from cvcdepth_ros.set_estimation import estimate_set
+from cvcdepth_ros.set_estimation import estimate_set, picture_or_error
 from cvcdepth_ros.surround_pipeline import PublishedSet, SurroundPipeline
 from cvcdepth_ros.synchronizer import SurroundSynchronizer
 
@@ -57,12 +60,15 @@ class Slowed:
         self._predictor = predictor
         self.gate = threading.Event()
         self.entered = threading.Event()
+        self.warm_up_gate = threading.Event()
+        self.warm_up_gate.set()
         self.cameras: list[int] = []
         self.warmed_up: list[int] = []
 
     def estimate(self, pictures: Any, fx: Any) -> Any:
         if not np.any(pictures):
             self.warmed_up.append(len(pictures))
+            assert self.warm_up_gate.wait(TIMEOUT)
             return self._predictor.estimate(pictures, fx)
         self.cameras.append(len(pictures))
         self.entered.set()
@@ -272,6 +278,113 @@ def test_closing_says_whether_the_last_set_is_done_with(start, estimator, images
     assert not running.pipeline.close()
     slowed.gate.set()
     running.wait(running.pipeline.close)
+
+
+def test_closing_waits_for_no_build_and_says_that_one_is_still_running(layout, estimator):
+    slowed = Slowed(estimator)
+    slowed.warm_up_gate.clear()
+    running = Running(layout, slowed)
+    running.pipeline.set_rig(layout.complete())
+    running.wait(lambda: slowed.warmed_up)
+    assert not running.pipeline.close()
+    slowed.warm_up_gate.set()
+    running.wait(running.pipeline.close)
+
+
+def test_closing_ends_the_wait_for_a_rig_that_will_never_be_built(layout, estimator, images):
+    slowed = Slowed(estimator)
+    slowed.warm_up_gate.clear()
+    running = Running(layout, slowed)
+    running.pipeline.set_rig(layout.complete())
+    running.wait(lambda: slowed.warmed_up)
+    for _ in range(8):  # all threads wait for the warm-up, and the last build for a thread
+        running.pipeline.set_rig(layout.complete())
+    running.feed(images[:12])
+    running.wait(lambda: running.mailbox.statistics().delivered)
+    running.pipeline.close()
+    running.wait(lambda: not any(thread.is_alive() for thread in running.pipeline._threads))
+    slowed.warm_up_gate.set()
+
+
+class Failing:
+    """A depth predictor whose device has failed."""
+
+    def __init__(self, predictor: DepthEstimator) -> None:
+        self.spec, self.model_id = predictor.spec, predictor.model_id
+
+    def estimate(self, pictures: Any, fx: Any) -> Any:
+        raise EngineError("torch on cuda: out of memory with a single picture")
+
+
+def test_a_network_that_cannot_run_is_told_of_the_set_and_not_of_the_cameras_and_another_takes_over(
+    start, estimator, layout, images
+):
+    running = start(Failing(estimator))
+    running.feed(images[:12])
+    running.wait(lambda: running.pipeline.problem)
+    assert running.pipeline.problem == "torch on cuda: out of memory with a single picture"
+    assert not running.pipeline.rig_problems
+    with pytest.raises(EngineError):
+        running.pipeline.set_model(Failing(estimator))
+    running.pipeline.set_model(estimator)
+    running.feed(images[12:])
+    running.wait(lambda: running.published)
+
+
+def test_another_network_is_warmed_up_before_it_gets_a_set(start, estimator, images):
+    running = start(estimator)
+    slowed = Slowed(estimator)
+    slowed.gate.set()
+    running.pipeline.set_model(slowed)
+    assert slowed.warmed_up == [6]
+    running.feed(images[:12])
+    running.wait(lambda: slowed.cameras)
+
+
+@pytest.fixture
+def with_a_foreign_mask(layout, tmp_path) -> Any:
+    """The layout with a mask for camera left that has another size than its images."""
+    mask = tmp_path / "mask.png"
+    cv2.imwrite(str(mask), np.full((10, 20), 255, np.uint8))
+    cameras = (c.model_copy(update={"mask": mask}) if c.name == "left" else c for c in layout.cameras)
+    return layout.model_copy(update={"cameras": tuple(cameras)}).complete()
+
+
+def test_a_camera_whose_maps_cannot_be_built_costs_the_others_nothing_with_min_cameras(
+    start, estimator, images, with_a_foreign_mask
+):
+    running = start(estimator, min_cameras=4)
+    running.pipeline.set_rig(with_a_foreign_mask)
+    running.feed(images[:12])
+    running.wait(lambda: running.published)
+    assert "left" not in running.published[-1].rig.names
+    assert running.pipeline.rig_problems.keys() == {"left"}
+    assert "image of 20x10" in running.pipeline.rig_problems["left"]
+
+
+def test_without_min_cameras_a_camera_whose_maps_cannot_be_built_is_named_alone(
+    start, estimator, images, with_a_foreign_mask
+):
+    running = start(estimator)
+    running.pipeline.set_rig(with_a_foreign_mask)
+    running.feed(images[:12])
+    running.wait(lambda: running.pipeline.counters["skipped: rig not complete"])
+    assert running.pipeline.rig_problems.keys() == {"left"}
+
+
+class TooWide(Rectifier):
+    """Meets what OpenCV does not: more than 32767 columns."""
+
+    def __call__(self, *_: Any) -> Any:
+        return cv2.remap(np.zeros((1, 40_000), np.uint8), *self._maps, cv2.INTER_LINEAR)
+
+
+def test_what_opencv_raises_costs_one_image_and_names_its_camera(layout, images):
+    camera, message = images[0]
+    calibration = next(c.calibration for c in layout.cameras if c.name == camera)
+    outcome = picture_or_error(message, camera, TooWide(calibration, 96, 160), StageLatencies())
+    assert isinstance(outcome, ImageError)
+    assert str(outcome).startswith(f"camera {camera}: error: OpenCV")
 
 
 def test_an_image_of_another_size_than_its_calibrations_is_told_in_full_size(start, estimator, layout, images):

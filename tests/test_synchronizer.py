@@ -202,6 +202,8 @@ def test_whatever_comes_in_the_sets_keep_their_promises(s: Streams, seed: int, t
             assert of_camera.received == of_camera.matched + of_camera.queued + sum(of_camera.dropped.values())
         for surround_set in sets:
             corrected = [s.corrected(c, stamp) for c, stamp in surround_set.stamps_ns.items()]
+            assert [*surround_set.times_ns.values()] == corrected
+            assert surround_set.time_ns == s.corrected(surround_set.anchor, surround_set.stamp_ns)
             assert surround_set.spread_ns == max(corrected) - min(corrected) <= round(tolerance * s.period) + 1
             assert [s.arrivals[surround_set.images[c]] for c in s.cameras] == list(surround_set.stamps_ns.items())
             assert used.isdisjoint(surround_set.images.values())
@@ -438,15 +440,6 @@ def test_flush_counts_what_no_set_could_use():
     assert (cameras["a"].dropped, cameras["b"].dropped) == ({"unmatched": 1}, {"unmatched": 2})
 
 
-def test_reset_drops_the_queues_and_keeps_the_counters():
-    synchronizer = pair()
-    add_all(synchronizer, ("b", 200), ("b", 300))
-    synchronizer.reset()
-    b = synchronizer.statistics().cameras["b"]
-    assert (b.received, b.queued, b.dropped, b.period_ns) == (2, 0, {"reset": 2}, 100 * MS)
-    assert add_all(synchronizer, ("b", 100), ("a", 100), ("a", 200), ("b", 200))[0] == {"a": 100, "b": 100}
-
-
 def test_a_faster_camera_gives_its_nearest_image_without_waiting_for_the_next():
     synchronizer = pair()
     sets = add_all(synchronizer, *sorted([("b", 30 * i) for i in range(12)] + [("a", 95)], key=lambda x: x[1]))
@@ -516,8 +509,9 @@ def test_an_image_of_an_unknown_camera_is_refused_by_name():
 # --- mailbox --------------------------------------------------------------------------------------------------------
 
 
-def numbered_set(sequence: int, stamp_ns: int = 0) -> SurroundSet[str]:
-    return SurroundSet(sequence, "front", stamp_ns, {}, {}, 0)
+def numbered_set(sequence: int, time_ns: int = 0) -> SurroundSet[str]:
+    """A set whose anchor's clock is an hour ahead, as its rig file knows."""
+    return SurroundSet(sequence, "front", time_ns + 36_000 * PERIOD, {}, {"front": time_ns}, {}, 0)
 
 
 def test_the_newest_set_wins_and_the_replaced_one_is_counted():
@@ -543,9 +537,9 @@ def test_a_set_handed_over_after_a_newer_one_is_not_stored():
 def test_a_set_older_than_the_freshness_gate_is_dropped_when_it_is_read():
     now = [10_000 * MS]
     mailbox: Mailbox[str] = Mailbox(max_age=0.5, clock=lambda: now[0])
-    mailbox.put(numbered_set(0, stamp_ns=9_500 * MS))
-    assert mailbox.get(timeout=0) == numbered_set(0, stamp_ns=9_500 * MS)
-    mailbox.put(numbered_set(1, stamp_ns=9_900 * MS))
+    mailbox.put(numbered_set(0, time_ns=9_500 * MS))
+    assert mailbox.get(timeout=0) == numbered_set(0, time_ns=9_500 * MS)
+    mailbox.put(numbered_set(1, time_ns=9_900 * MS))
     now[0] = 10_401 * MS
     assert mailbox.get(timeout=0) is None
     assert (mailbox.statistics().delivered, mailbox.statistics().stale) == (1, 1)
@@ -649,6 +643,23 @@ def test_another_camera_stands_in_for_the_anchor_until_it_returns():
     assert [(s.anchor, len(s.images)) for s in back][-4:] == [("front", 6)] * 4
     stamps = [s.stamp_ns for s in alive + headless + back]
     assert stamps == sorted(set(stamps))
+
+
+@pytest.mark.parametrize("min_cameras", [1, 4, 5])
+@pytest.mark.parametrize("camera", ["front", "back"])
+@pytest.mark.parametrize("ahead", [15 * PERIOD, 36_000 * PERIOD])
+@pytest.mark.parametrize("healthy", [0, 5])
+def test_a_camera_whose_clock_is_ahead_costs_its_own_images_only_even_when_it_is_the_anchor(
+    min_cameras: int, camera: str, ahead: int, healthy: int
+):
+    synchronizer = partial_synchronizer(min_cameras)
+    feed(synchronizer, cycles(PANDASET, 0, healthy), flush=False)
+    wrong = [(name, stamp + ahead * (name == camera)) for name, stamp in cycles(PANDASET, healthy, 20)]
+    sets = [s for s in feed(synchronizer, wrong, flush=False) if len(s.images) == 5]
+    assert len(sets) >= 14
+    assert all(list(s.images) == without(camera) and s.anchor == without(camera)[0] for s in sets)
+    mended = feed(synchronizer, cycles(PANDASET, healthy + 20, 10))
+    assert [(s.anchor, len(s.images)) for s in mended][-5:] == [("front", 6)] * 5
 
 
 def test_too_few_cameras_give_no_set():

@@ -3,7 +3,8 @@
 
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from copy import deepcopy
 from dataclasses import replace
 from itertools import chain
 
@@ -177,6 +178,21 @@ def test_a_camera_that_fires_later_stands_further_along_the_way(index):
     assert np.ptp(ahead) > 0.2
 
 
+@pytest.mark.parametrize("motion", ["recorded", "network"])
+def test_a_camera_whose_clock_is_ahead_stands_where_it_was_when_it_fired(index, motion, tmp_path):
+    ahead = restamped(sample_entries(), "/camera/left/image_raw/compressed", lambda _, stamp: stamp + 3_200_000_000)
+    cameras = [
+        camera.model_copy(update={"stamp_offset": 3.2}) if camera.name == "left" else camera
+        for camera in index.layout.cameras
+    ]
+    layout = index.layout.model_copy(update={"cameras": tuple(cameras)})
+    shifted = build_index(write_rosbag2(tmp_path / "ahead", ahead), MATCHING, layout)
+    settings = EVERYTHING.model_copy(update={"exposure_motion": motion})
+    found, expected = (reader(of, settings)[3] for of in (shifted, build_index(SAMPLE, MATCHING, index.layout)))
+    for shown, there in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(shown, there)
+
+
 def test_the_network_is_told_the_delays_that_no_recorded_motion_makes_good_for(index, tmp_path):
     blind = build_index(write_rosbag2(tmp_path / "blind", without(sample_entries(), "/odom", "/tf")), MATCHING)
     delays = (index.stamps[3] - index.stamps[3, index.anchor]) / 1e9
@@ -305,6 +321,56 @@ def test_an_index_is_kept_and_built_anew_when_the_recording_changes(tmp_path, in
     assert len(load_index(bag, tmp_path / "index", MATCHING)) == len(fresh)
 
 
+def spoiled(entries: list[Entry], topic: str, number: int, spoil: Callable[[Entry], Entry]) -> list[Entry]:
+    """The same recording with one message of a topic spoiled."""
+    at = [i for i, entry in enumerate(entries) if entry.topic == topic][number]
+    return [spoil(entry) if i == at else entry for i, entry in enumerate(entries)]
+
+
+def without_direction(entry: Entry) -> Entry:
+    message = JAZZY.deserialize_cdr(entry.cdr, entry.type)
+    turn = message.transforms[0].transform.rotation if entry.topic == "/tf" else message.pose.pose.orientation
+    turn.x = turn.y = turn.z = turn.w = 0.0
+    return entry._replace(cdr=bytes(JAZZY.serialize_cdr(message, entry.type)))
+
+
+def cut_short(entry: Entry) -> Entry:
+    return entry._replace(cdr=entry.cdr[:40])
+
+
+@pytest.mark.parametrize("spoil", [without_direction, cut_short])
+@pytest.mark.parametrize(("topic", "other"), [("/tf", "/odom"), ("/odom", "/tf")])
+def test_an_impossible_pose_costs_itself_only_and_is_told(spoil, topic, other, index, tmp_path):
+    for number, placed in ((0, 9), (13, 10)):
+        entries = spoiled(without(sample_entries(), other), topic, number, spoil)
+        recording = load_index(write_rosbag2(tmp_path / f"{number}", entries), tmp_path / "index", MATCHING)
+        assert (len(recording), recording.unplaced) == (placed, 10 - placed)
+        np.testing.assert_allclose(recording.poses, index.poses[-placed:], atol=0.02)
+        (told,) = recording.refused
+        assert told.startswith("1 refused, the first: ")
+        assert topic in told
+        again = load_index(tmp_path / f"{number}", tmp_path / "index", MATCHING)
+        assert again.refused == recording.refused
+
+
+def test_a_broken_link_of_a_wheel_does_not_cost_the_vehicles_pose_beside_it(index, tmp_path):
+    def with_wheel(message):
+        wheel = deepcopy(message.transforms[0])
+        wheel.header.frame_id, wheel.child_frame_id, wheel.transform.rotation.w = "base_link", "wheel", 9.0
+        message.transforms = [wheel, *message.transforms]
+
+    recording = build_index(write_rosbag2(tmp_path / "bag", changed(sample_entries(), "/tf", with_wheel)), MATCHING)
+    np.testing.assert_array_equal(recording.poses, index.poses)
+
+
+def test_a_camera_info_that_cannot_be_read_costs_no_set_and_is_told(tmp_path):
+    entries = spoiled(sample_entries(3), "/camera/left/camera_info", 1, cut_short)
+    recording = build_index(write_rosbag2(tmp_path / "bag", entries), MATCHING)
+    assert len(recording) == 3
+    assert "1 refused, the first:" in recording.refused[0]
+    assert "/camera/left/camera_info at" in recording.refused[0]
+
+
 def test_a_camera_without_images_is_refused_by_name(tmp_path):
     entries = without(sample_entries(2), "/camera/left/image_raw/compressed")
     with pytest.raises(RecordingError, match=r"lame: /camera/left/camera_info is recorded, but no image"):
@@ -340,7 +406,7 @@ def test_an_index_tells_what_of_the_recording_was_not_there_to_learn_from(index,
     for found in (build_index(recording, MATCHING), *(load_index(recording, tmp_path, MATCHING) for _ in range(2))):
         damage, unreadable, undecodable = found.losses
         assert damage.startswith(f"not everything could be read: {recording}: ")
-        assert unreadable.startswith(f"1 images could not be read, the first: camera front: {recording}: {topic} at ")
+        assert unreadable.startswith(f"1 refused, the first: camera front: {recording}: {topic} at ")
         assert undecodable == "1 sets are left out: no picture of camera front could be decoded"
 
 

@@ -41,12 +41,37 @@ class TorchEngine:
         self.chunk = best_chunk(device)
         mixed = MixedPrecision(RewrittenDepthNet(network), getattr(torch, precision))
         mixed = mixed.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self._run: Callable[[Tensor], Tensor] = CudaGraphs(torch.compile(mixed, dynamic=False)) if compiled else mixed
+        self._run: Callable[[Tensor], Tensor] = mixed
+        if compiled:
+            self._run = PaddedBatches(CudaGraphs(torch.compile(mixed, dynamic=False)))
 
     @torch.inference_mode()
     def disparity(self, images: Tensor) -> Tensor:
         """See `DisparityEngine`."""
         return self._run(images.contiguous(memory_format=torch.channels_last))
+
+
+class PaddedBatches:
+    """Fills smaller batches up to the largest that has come: a compiled network is compiled anew for every size.
+
+    When a camera dies, the others must not wait for a compiler.
+    """
+
+    def __init__(self, network: Callable[[Tensor], Tensor]) -> None:
+        self._network = network
+        self._largest = 0
+
+    def __call__(self, images: Tensor) -> Tensor:
+        """Return what the network gives for these images."""
+        missing = max(0, self._largest - len(images))
+        padded = torch.cat([images, images.new_zeros(missing, *images.shape[1:])]) if missing else images
+        try:
+            given = self._network(padded.contiguous(memory_format=torch.channels_last))
+        except RuntimeError:
+            self._largest = 0  # memory that held so many pictures may not do so for ever
+            raise
+        self._largest = len(padded)
+        return given[: len(images)]
 
 
 class CudaGraphs:

@@ -22,7 +22,7 @@ from cvcdepth_core.errors import CvcDepthError
 from cvcdepth_core.estimator import SurroundDepthEstimator
 from cvcdepth_core.rig import load_rig_layout
 from cvcdepth_ros.bench.straightforward import straightforward_cloud
-from cvcdepth_ros.diagnostics import inference_status, synchronisation_status
+from cvcdepth_ros.diagnostics import SynchronisationStatus, inference_status
 from cvcdepth_ros.inputs import CameraInputs
 from cvcdepth_ros.latencies import StageLatencies
 from cvcdepth_ros.mailbox import MailboxStatistics
@@ -54,6 +54,7 @@ class StraightforwardNode(Node):  # type: ignore[misc] # rclpy is not annotated
         }
         self._latencies = StageLatencies()
         self._counters = Counter({"published": 0, "refused": 0})
+        self._synchronisation = SynchronisationStatus(self._settings.max_age)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._inputs = CameraInputs(self, layout, self._settings.reliable, self._on_image, lambda *_: None)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -84,7 +85,7 @@ class StraightforwardNode(Node):  # type: ignore[misc] # rclpy is not annotated
 
     def _publish_diagnostics(self) -> None:
         statuses = [
-            synchronisation_status(self._synchroniser.statistics(), MailboxStatistics(), self._counters),
+            self._synchronisation.of(self._synchroniser.statistics(), MailboxStatistics(), self._counters),
             inference_status(self._latencies.summaries(), MailboxStatistics(), "", self._estimator.model_id),
         ]
         for entry in statuses:

@@ -16,11 +16,11 @@ from cvcdepth_core.errors import ImageError, RecordingError, RigError, Transform
 from cvcdepth_core.images import Picture
 from cvcdepth_core.rig import Rig, RigLayout
 from cvcdepth_ros.bags import RecordedMessage, Recording
-from cvcdepth_ros.lidar import VehicleMotion, cloud_topics
+from cvcdepth_ros.lidar import VehicleMotion, find_lidars
 from cvcdepth_ros.messages import picture_from_message
 from cvcdepth_ros.recorded_rig import IMAGE_TYPES, collect_rig, discover_layout
 from cvcdepth_ros.rig_assembly import RigAssembler
-from cvcdepth_ros.synchronizer import SurroundSet, SurroundSynchronizer
+from cvcdepth_ros.synchronizer import NANOSECONDS, SurroundSet, SurroundSynchronizer
 from cvcdepth_ros.topic_timing import TopicTiming
 
 Status = Literal["passed", "warning", "failed", "skipped"]
@@ -54,7 +54,7 @@ class CheckOptions:
     base_frame: str = "base_link"
     """The vehicle's frame where no rig file names it."""
     lidar: tuple[str, ...] | None = None
-    """LiDAR topics; None for all point clouds of the recording."""
+    """LiDAR topics; None for all of the recording, see `find_lidars`."""
     start: int | None = None
     """First log time to read, ns."""
     stop: int | None = None
@@ -89,7 +89,7 @@ class CheckContext:
         """Why the cameras make no rig at all."""
         self.assembler = self._collected(rig_layout)
         """None where the cameras make no rig, or the transforms contradict each other."""
-        self.lidars = options.lidar if options.lidar is not None else tuple(cloud_topics(recording))
+        self.lidars, self.clouds_of_cameras = find_lidars(recording) if options.lidar is None else (options.lidar, ())
         self.motion = self._found_motion()
         self.motion_problem: str | None = None
         """The first impossible pose."""
@@ -126,6 +126,12 @@ class CheckContext:
     def stamps(self, camera: str) -> NDArray[np.int64]:
         """Return the stamps [M] of a camera's images, ns, sorted."""
         return np.array(sorted(image.stamp for image in self.images if image.camera == camera), dtype=np.int64)
+
+    def times(self, camera: str) -> NDArray[np.int64]:
+        """Return when a camera's images were taken [M], ns, sorted: their stamps without the camera's offset."""
+        entries = self.assembler.layout.cameras if self.assembler else ()
+        offsets = {entry.name: round(entry.stamp_offset * NANOSECONDS) for entry in entries}
+        return self.stamps(camera) - offsets[camera]
 
     def match(
         self, layout: RigLayout, tolerance: float, changed_offsets: Mapping[str, float] | None = None

@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -78,18 +81,52 @@ def check_lidar(context: CheckContext) -> CheckResult:
     if missing:
         remedy = f"name a topic with point clouds; there are {', '.join(clouds) or 'none'}"
         return CheckResult("failed", f"no sweep on {', '.join(missing)}", remedy, {"missing": missing})
+    if context.options.lidar == ():
+        return CheckResult("skipped", "no LiDAR is wanted")
     if not context.lidars:
         remedy = "without a LiDAR, `evaluate` gives the label-free scores only"
-        return CheckResult("warning", "no point cloud is recorded", remedy)
+        return _with_left_out(context, CheckResult("warning", "no LiDAR's point cloud is recorded", remedy))
     rig, assembler = context.rig, context.assembler
     if rig is None or assembler is None:
         return _NEEDS_RIG
-    try:
-        shares = {topic: _projected(context, rig, topic, assembler.transforms) for topic in context.lidars}
-    except (RecordingError, TransformError) as error:
-        remedy = "publish the LiDAR's frame on /tf_static; clouds need x, y and z as float32 or float64"
-        return CheckResult("failed", str(error), remedy)
-    return _judge_projection(shares)
+    shares, refusals = _projections(context, rig, assembler.transforms)
+    result = _judge_projection(shares) if shares else CheckResult("failed", "no sweep can be used")
+    return _with_left_out(context, _with_refusals(result, refusals))
+
+
+def _projections(
+    context: CheckContext, rig: Rig, transforms: TransformTree
+) -> tuple[dict[str, dict[str, float]], list[str]]:
+    """Return what `_projected` says of each LiDAR, and why there is nothing to say of the others."""
+    shares: dict[str, dict[str, float]] = {}
+    refusals = []
+    for topic in context.lidars:
+        try:
+            shares[topic] = _projected(context, rig, topic, transforms)
+        except (RecordingError, TransformError) as error:
+            refusals.append(str(error))
+    return shares, refusals
+
+
+def _with_refusals(result: CheckResult, refusals: Sequence[str]) -> CheckResult:
+    if not refusals:
+        return result
+    remedy = "publish the LiDAR's frame on /tf_static; clouds need x, y and z as float32 or float64"
+    return _worsened(result, "; ".join(refusals), remedy)
+
+
+def _with_left_out(context: CheckContext, result: CheckResult) -> CheckResult:
+    if not context.clouds_of_cameras:
+        return result
+    finding = f"not taken for a LiDAR's, since their points have colours: {', '.join(context.clouds_of_cameras)}"
+    return _worsened(result, finding, "name the LiDARs with --lidar, and nothing else is looked at")
+
+
+def _worsened(result: CheckResult, finding: str, remedy: str) -> CheckResult:
+    """Add to what a check found something that is no more than a warning."""
+    status: Status = "failed" if result.status == "failed" else "warning"
+    remedy = f"{result.remedy}; {remedy}" if result.remedy else remedy
+    return replace(result, status=status, finding=f"{result.finding}; {finding}", remedy=remedy)
 
 
 def _judge_projection(shares: dict[str, dict[str, float]]) -> CheckResult:
@@ -124,7 +161,7 @@ def _projected(context: CheckContext, rig: Rig, topic: str, transforms: Transfor
             return {
                 camera.name: _share_inside(camera, swept.points)
                 for camera in rig.cameras
-                if (swept := lidar.at(_nearest(context.stamps(camera.name), stamp_ns(message)))) is not None
+                if (swept := lidar.at(_nearest(context.times(camera.name), stamp_ns(message)))) is not None
             }
         except TransformError as error:
             refusal = error
@@ -133,9 +170,9 @@ def _projected(context: CheckContext, rig: Rig, topic: str, transforms: Transfor
     return {}
 
 
-def _nearest(stamps: NDArray[np.int64], stamp: int) -> int:
-    """Return the nearest stamp; the given one where there are none."""
-    return int(stamps[np.argmin(abs(stamps - stamp))]) if stamps.size else stamp
+def _nearest(times: NDArray[np.int64], stamp: int) -> int:
+    """Return the time nearest to a stamp; the stamp where there are none."""
+    return int(times[np.argmin(abs(times - stamp))]) if times.size else stamp
 
 
 def _share_inside(camera: Camera, points: NDArray[np.float64]) -> float:
@@ -172,10 +209,10 @@ def check_motion(context: CheckContext) -> CheckResult:
 def _track(context: CheckContext, camera: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return times [M] (s) and positions [M, 3] (m) of the vehicle at the camera's images, where they are known."""
     times, positions = [], []
-    for stamp in np.unique(context.stamps(camera)).tolist():
+    for time in np.unique(context.times(camera)).tolist():
         try:
-            positions.append(context.motion.base_pose(stamp)[:3, 3] if context.motion else np.zeros(3))
+            positions.append(context.motion.base_pose(time)[:3, 3] if context.motion else np.zeros(3))
         except TransformError:
             continue
-        times.append(stamp / NANOSECONDS)
+        times.append(time / NANOSECONDS)
     return np.array(times), np.array(positions).reshape(-1, 3)

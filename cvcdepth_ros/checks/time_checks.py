@@ -78,11 +78,9 @@ def _spread(sets: Sequence[SurroundSet[int]], layout: RigLayout) -> dict[str, An
 def _seconds_later(sets: Sequence[SurroundSet[int]], layout: RigLayout) -> dict[str, float]:
     """Return the median seconds by which each camera's corrected stamp is later than the anchor's."""
     anchor = layout.anchor_camera
-    offsets = {camera.name: camera.stamp_offset for camera in layout.cameras}
 
     def later(camera: str) -> float:
-        apart = [found.stamps_ns[camera] - found.stamps_ns[anchor] for found in sets]
-        return float(np.median(apart)) / NANOSECONDS - offsets[camera] + offsets[anchor]
+        return float(np.median([found.times_ns[camera] - found.times_ns[anchor] for found in sets])) / NANOSECONDS
 
     return {camera: later(camera) for camera in layout.names}
 

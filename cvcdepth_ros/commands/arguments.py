@@ -41,6 +41,23 @@ def add_quiet(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
+def add_lidar(parser: argparse.ArgumentParser) -> None:
+    """Declare which topics are the LiDARs', for `lidar_topics`."""
+    lidar = parser.add_mutually_exclusive_group()
+    lidar.add_argument(
+        "--lidar",
+        action="append",
+        metavar="TOPIC",
+        help="a LiDAR; can be repeated [all point clouds of a recording without colours: those with come from cameras]",
+    )
+    lidar.add_argument("--no-lidar", action="store_true", help="as if there were none: label-free scores only")
+
+
+def lidar_topics(arguments: argparse.Namespace) -> tuple[str, ...] | None:
+    """Return the LiDARs that are wanted; None: those of each recording."""
+    return () if arguments.no_lidar else tuple(arguments.lidar) if arguments.lidar else None
+
+
 def add_window(parser: argparse.ArgumentParser) -> None:
     """Declare the part of the recording that is wanted."""
     parser.add_argument(

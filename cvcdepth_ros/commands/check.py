@@ -12,10 +12,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from cvcdepth_core.errors import CvcDepthError, RecordingError
 from cvcdepth_ros.commands.arguments import (
     add_json,
+    add_lidar,
     add_quiet,
     add_recordings,
     add_skip,
     add_window,
+    lidar_topics,
     positive,
     print_result,
     recording_progress,
@@ -72,9 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help=f"seconds that two images of one set may be apart [{tolerance:g}]",
     )
-    parser.add_argument(
-        "--lidar", action="append", metavar="TOPIC", help="a LiDAR; can be repeated [all point clouds of a recording]"
-    )
+    add_lidar(parser)
     add_skip(parser)
     add_window(parser)
     add_quiet(parser)
@@ -106,7 +106,7 @@ def _checked(location: "Location", layout: "RigLayout | None", arguments: argpar
             options = CheckOptions(
                 tolerance=arguments.tolerance,
                 base_frame=arguments.base_frame,
-                lidar=tuple(arguments.lidar) if arguments.lidar else None,
+                lidar=lidar_topics(arguments),
                 start=window[0],
                 stop=window[1],
             )

@@ -13,11 +13,13 @@ from typing import TYPE_CHECKING, Any
 from cvcdepth_core.atomic_file import write_atomically
 from cvcdepth_ros.commands.arguments import (
     add_json,
+    add_lidar,
     add_quiet,
     add_recordings,
     add_settings,
     add_window,
     can_draw,
+    lidar_topics,
     print_result,
     settings_from,
     table,
@@ -63,11 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     network.add_argument(
         "--compare", nargs=2, type=Path, metavar=("A", "B"), help="two metrics.json: is B better than A?"
     )
-    lidar = parser.add_mutually_exclusive_group()
-    lidar.add_argument(
-        "--lidar", action="append", metavar="TOPIC", help="a LiDAR; can be repeated [all point clouds of a recording]"
-    )
-    lidar.add_argument("--no-lidar", action="store_true", help="label-free scores only")
+    add_lidar(parser)
     parser.add_argument("--rig", type=Path, metavar="FILE", help="rig file [the cameras found in each recording]")
     parser.add_argument(
         "--base-frame", metavar="FRAME", default="base_link", help="without --rig: the vehicle's frame [base_link]"
@@ -161,7 +159,7 @@ def _result(
         for job, outcome in evaluate_all(jobs, arguments.workers or 1, kept, progress, pool):
             outcomes.append(outcome)
             if not isinstance(outcome, Failure):
-                _warn_of_damage(job, outcome)
+                _warn_of_losses(job, outcome)
     failed = [outcome for outcome in outcomes if isinstance(outcome, Failure)]
     for failure in failed if len(failed) < len(outcomes) else failed[1:]:
         warn(f"not evaluated: {failure.reason}")
@@ -187,8 +185,8 @@ def _jobs(arguments: argparse.Namespace, settings: EvaluationSettings) -> list[E
     locations = find_recordings(arguments.recordings)
     names = unique_names([(location.name, str(location)) for location in locations])
     layout = load_rig_layout(arguments.rig) if arguments.rig else None
-    lidar = () if arguments.no_lidar else tuple(arguments.lidar) if arguments.lidar else None
-    job = EvaluationJob("", "", settings, layout, arguments.base_frame, lidar, arguments.start, arguments.duration)
+    lidar, window = lidar_topics(arguments), (arguments.start, arguments.duration)
+    job = EvaluationJob("", "", settings, layout, arguments.base_frame, lidar, *window)
     return [replace(job, name=name, path=str(path)) for name, path in zip(names, locations, strict=True)]
 
 
@@ -208,11 +206,14 @@ def unique_names(candidates: Sequence[tuple[str, str]]) -> list[str]:
     return [short if counts[short] == 1 else long for short, long in candidates]
 
 
-def _warn_of_damage(job: EvaluationJob, scores: "RecordingScores") -> None:
+def _warn_of_losses(job: EvaluationJob, scores: "RecordingScores") -> None:
     damage, sets = scores.summary["damage"], scores.summary["sets"]["scored"]
     if damage:
         seconds = scores.summary["seconds"]
         warn(f"{job.path}: not everything could be read: {damage}; evaluated {sets} sets of the {seconds:.1f} s there")
+    left_out = scores.summary["clouds_of_cameras"]
+    if left_out:
+        warn(f"{job.path}: not taken for a LiDAR's, since their points have colours: {', '.join(left_out)}")
     refusals = scores.summary["truth_refused"]
     if refusals["count"]:
         warn(f"{job.path}: {refusals['count']} times no truth, the first: {refusals['reasons'][0]}")

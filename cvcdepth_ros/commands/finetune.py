@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Any
 from cvcdepth_core.errors import ConfigError, NotPromotedError
 from cvcdepth_ros.commands.arguments import (
     add_json,
+    add_lidar,
     add_quiet,
     add_recordings,
     add_skip,
     can_draw,
+    lidar_topics,
     print_result,
     refuse_unknown_checks,
     table,
@@ -51,6 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--no-masks", action="store_true", help="do not look for the vehicle's own body in the recordings"
     )
+    add_lidar(parser)
     add_skip(parser)
     parser.add_argument("--device", default="auto", help="auto (CUDA where there is one), cpu, cuda, cuda:1 ... [auto]")
     add_quiet(parser)
@@ -107,6 +110,7 @@ def _order(arguments: argparse.Namespace) -> "Order":
         MatchingSettings.model_validate({"tolerance": config.recordings.tolerance}),
         tuple(arguments.skip),
         not arguments.no_masks,
+        lidar_topics(arguments),
     )
     start = None if arguments.start is None else load_checkpoint(checkpoint_path(arguments.start))
     return Order(source, config, arguments.output, start, arguments.device, arguments.quiet)

@@ -65,7 +65,7 @@ class SheetWriter:
         """Return the LiDAR's points at the set's stamp, and what the caption says of them."""
         seen = "Right: the scene from above, grid 10 m; the merged cloud in its own colours, brightened"
         try:
-            points = self._lidar.at(surround.sent.stamp_ns, surround.sent.images[self._rig.anchor])
+            points = self._lidar.at(surround.sent.time_ns, surround.sent.images[self._rig.anchor])
         except TransformError as error:
             return None, f"{seen}, no LiDAR ({error})"
         return points, f"{seen}, {'LiDAR in cyan' if points is not None else 'no LiDAR recorded'}"

@@ -109,7 +109,7 @@ class EvaluationJob:
     base_frame: str = "base_link"
     """The vehicle's frame, where `layout` is None."""
     lidar: tuple[str, ...] | None = None
-    """Topics of the LiDARs; none: the vehicle has none; None: all point clouds of the recording."""
+    """Topics of the LiDARs; none: the vehicle has none; None: all of the recording, see `find_lidars`."""
     start: float = 0.0
     """Seconds of the recording to skip."""
     duration: float | None = None

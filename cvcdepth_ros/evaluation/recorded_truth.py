@@ -13,7 +13,7 @@ from cvcdepth_core.poses import Pose
 from cvcdepth_core.rig import Rig
 from cvcdepth_core.visualization import Points
 from cvcdepth_ros.bags import RecordedMessage
-from cvcdepth_ros.lidar import CLOUD_TYPE, LidarSweeps, VehicleMotion, cloud_topics
+from cvcdepth_ros.lidar import CLOUD_TYPE, LidarSweeps, VehicleMotion, cloud_topics, find_lidars
 from cvcdepth_ros.replay import Refusals, SurroundReplay
 from cvcdepth_ros.synchronizer import NANOSECONDS
 
@@ -28,12 +28,15 @@ class RecordedTruth:
     """
 
     def __init__(self, replay: SurroundReplay, lidar: Sequence[str] | None, tolerance: float) -> None:
-        """`lidar` names the topics (None: all point clouds), `tolerance` is in seconds; see `LidarSweeps`.
+        """`lidar` names the topics (None: see `find_lidars`), `tolerance` is in seconds; see `LidarSweeps`.
 
         Raises RecordingError for a topic that is not there or carries no point clouds.
         """
         self._recording, base_frame = replay.recording, replay.layout.base_frame
-        self.topics = tuple(cloud_topics(self._recording) if lidar is None else map(self._checked, lidar))
+        self.topics, self.left_out = (
+            find_lidars(self._recording) if lidar is None else (tuple(map(self._checked, lidar)), ())
+        )
+        """The LiDARs' topics, and those with clouds that come from cameras."""
         self.motion = VehicleMotion.find(self._recording, base_frame, replay.transforms)
         self.refused = Refusals()
         """Sweeps and moments that are no use, and why."""
@@ -50,30 +53,30 @@ class RecordedTruth:
         for message in self._recording.messages(self.handlers, start, stop):
             self.handlers[message.topic](message)
 
-    def points(self, stamp: int) -> Points | None:
-        """Return what the LiDARs saw nearest to a stamp (ns), [M, 3] metres in the base frame then; None: nothing."""
+    def points(self, time: int) -> Points | None:
+        """Return what the LiDARs saw nearest to a moment (ns), [M, 3] metres in the base frame then; None: nothing."""
         try:
-            swept = self._sweeps.at(stamp) if self.topics else None
+            swept = self._sweeps.at(time) if self.topics else None
         except TransformError as error:
             self.refused.add(str(error))
             return None
         return None if swept is None else swept.points
 
-    def camera_depth(self, rig: Rig, stamps: Mapping[str, int], occlusion: OcclusionFilter | None) -> list[SparseDepth]:
+    def camera_depth(self, rig: Rig, times: Mapping[str, int], occlusion: OcclusionFilter | None) -> list[SparseDepth]:
         """Return each camera's true depth at the moment of its picture (ns), at full size; empty where unknown."""
         truth = []
         for camera in rig.cameras:
-            points = self.points(stamps[camera.name])
+            points = self.points(times[camera.name])
             found = np.empty((0, 3)) if points is None else points
             truth.append(sparse_depth(found, PinholeView.of(camera), occlusion))
         return truth
 
-    def base_poses(self, rig: Rig, stamps: Mapping[str, int]) -> list[Pose] | None:
-        """Return world_T_base [4, 4] at each camera's stamp (ns); None where the motion is not known."""
+    def base_poses(self, rig: Rig, times: Mapping[str, int]) -> list[Pose] | None:
+        """Return world_T_base [4, 4] at each camera's moment (ns); None where the motion is not known."""
         if self.motion is None:
             return None
         try:
-            return [self.motion.base_pose(stamps[name]) for name in rig.names]
+            return [self.motion.base_pose(times[name]) for name in rig.names]
         except TransformError as error:
             self.refused.add(str(error))
             return None

@@ -159,10 +159,10 @@ class RecordingEvaluation:
     def _measured(self, estimated: EstimatedSet) -> MeasuredSet:
         images, rig = estimated.images, estimated.rig
         with self.latencies.measure("truth"):
-            truth = self.truth.camera_depth(rig, images.stamps_ns, self.job.settings.occlusion)
-            poses = self.truth.base_poses(rig, images.stamps_ns)
-            lidar = self.truth.points(images.stamp_ns)
-            self.truth.forget_before(min(images.stamps_ns.values()))
+            truth = self.truth.camera_depth(rig, images.times_ns, self.job.settings.occlusion)
+            poses = self.truth.base_poses(rig, images.times_ns)
+            lidar = self.truth.points(images.time_ns)
+            self.truth.forget_before(min(images.times_ns.values()))
         return MeasuredSet(estimated, truth, poses, lidar)
 
 
@@ -252,6 +252,7 @@ def _summary(evaluation: RecordingEvaluation, scoring: _Scoring) -> dict[str, An
         "anchor": replay.layout.anchor_camera,
         "seconds": (recording.end - recording.start) / NANOSECONDS,
         "lidar": list(truth.topics),
+        "clouds_of_cameras": list(truth.left_out),
         "motion": truth.motion.topic if truth.motion else None,
         "sets": {
             "scored": scoring.sets,

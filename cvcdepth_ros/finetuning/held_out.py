@@ -42,8 +42,10 @@ class HeldOutPart:
         return replace(self.job, start=seconds, duration=(stop - start) / NANOSECONDS)
 
 
-def held_out_parts(indexes: Sequence[RecordingIndex], config: TrainingConfig, device: str) -> list[HeldOutPart]:
-    """Return the held-out part of each recording that has one."""
+def held_out_parts(
+    indexes: Sequence[RecordingIndex], config: TrainingConfig, device: str, lidar: tuple[str, ...] | None
+) -> list[HeldOutPart]:
+    """Return the held-out part of each recording that has one; `lidar` is that of `EvaluationJob`."""
     settings = EvaluationSettings.model_validate(
         {
             "tolerance": config.recordings.tolerance,
@@ -57,7 +59,8 @@ def held_out_parts(indexes: Sequence[RecordingIndex], config: TrainingConfig, de
     parts = []
     for index, name in zip(indexes, names, strict=True):
         unique = name if names.count(name) == 1 else str(index.path)
-        part = _held_out_part(index, EvaluationJob(unique, str(index.path), settings, index.layout), config)
+        job = EvaluationJob(unique, str(index.path), settings, index.layout, lidar=lidar)
+        part = _held_out_part(index, job, config)
         if part is not None:
             parts.append(part)
     return parts

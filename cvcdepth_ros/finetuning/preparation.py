@@ -39,6 +39,8 @@ class Source:
     skipped_checks: Collection[str] = ()
     with_masks: bool = True
     """Whether to look for the vehicle's own body where the rig has no mask."""
+    lidar: tuple[str, ...] | None = None
+    """Topics of the LiDARs; none: the vehicle has none; None: those of each recording."""
 
 
 @dataclass
@@ -76,7 +78,8 @@ def prepare(source: Source, run: Path) -> Prepared:
 
 def checked(path: Location, source: Source, run: Path) -> list[NumberedResult]:
     """Run the checks of `bag_replay check`, or return what they found before in the very same recording and rig."""
-    options = CheckOptions(tolerance=source.matching.tolerance, queue_size=source.matching.queue_size)
+    matching = source.matching
+    options = CheckOptions(tolerance=matching.tolerance, queue_size=matching.queue_size, lidar=source.lidar)
     layout = source.layout
     key = {
         "version": package_version(),

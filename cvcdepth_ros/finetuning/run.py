@@ -92,7 +92,9 @@ def fine_tune(order: Order, processes: Processes, tell: Tell) -> FineTuned | Non
     batches = RecordingBatches(prepared.indexes, order.config, processes)
     model = build_surround_model(order.config, order.start)
     device = own_device(resolve_device(order.device))
-    parts = held_out_parts(prepared.indexes, order.config, str(device)) if processes.is_first else []
+    parts = []
+    if processes.is_first:
+        parts = held_out_parts(prepared.indexes, order.config, str(device), order.source.lidar)
     if parts:
         _keep_start(order, model)  # before the trainer fills the model with what a former call reached
     observers = [TensorBoardObserver(order.run)] if processes.is_first and has_tensorboard() else []

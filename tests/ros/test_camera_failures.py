@@ -13,7 +13,7 @@ from recordings import CAMERAS
 
 pytest.importorskip("rclpy", reason="these tests need a ROS environment")
 
-from camera_faults import frozen, silent
+from camera_faults import FAULTS, frozen, silent
 from camera_scene import CLOUD, DEPTH, Scene, running_scene, stamp_of
 from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import CameraInfo
@@ -46,6 +46,19 @@ def test_another_camera_stands_in_for_a_dead_anchor(scene):
     assert stamp_of(cloud) in scene.cameras.sent[CAMERAS[1]]
     scene.recover()
     assert stamp_of(scene.graph.received[CLOUD][-1]) in scene.cameras.sent[anchor]
+
+
+@pytest.mark.parametrize("camera", CAMERAS[:2])
+def test_a_camera_whose_clock_is_an_hour_ahead_is_told_and_left_out_even_when_it_is_the_anchor(scene, camera):
+    scene.fail(**{camera: FAULTS["stamps an hour ahead"].image})
+    scene.await_state(camera, "unmatched")
+    scene.await_cameras([name for name in CAMERAS if name != camera])
+
+
+def test_a_wrong_clock_is_told_beside_a_dead_camera(scene):
+    scene.fail(left=silent, right=FAULTS["stamps an hour ahead"].image)
+    scene.await_state("right", "unmatched")
+    scene.await_state("left", "stale")
 
 
 def test_too_few_cameras_hold_everything_back(scene):
