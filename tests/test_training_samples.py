@@ -122,7 +122,7 @@ def test_a_clock_that_is_set_meanwhile_does_not_change_what_is_held_out(tmp_path
     training, held_out = (find_samples(index, part, name) for name in ("training", "held_out"))
     assert max(chain.from_iterable(sample[1:] for sample in training)) == 3
     assert min(chain.from_iterable(sample[1:] for sample in held_out)) == len(index) - 4 == 6
-    (found,) = held_out_parts([index], config(recordings=part), "cpu")
+    (found,) = held_out_parts([index], config(recordings=part), "cpu", None)
     assert found.spans[0][0] > index.log_times[:6].max()
 
 
@@ -346,11 +346,11 @@ def test_an_impossible_pose_costs_itself_only_and_is_told(spoil, topic, other, i
         recording = load_index(write_rosbag2(tmp_path / f"{number}", entries), tmp_path / "index", MATCHING)
         assert (len(recording), recording.unplaced) == (placed, 10 - placed)
         np.testing.assert_allclose(recording.poses, index.poses[-placed:], atol=0.02)
-        (told,) = recording.refused
+        (told,) = recording.unread
         assert told.startswith("1 refused, the first: ")
         assert topic in told
         again = load_index(tmp_path / f"{number}", tmp_path / "index", MATCHING)
-        assert again.refused == recording.refused
+        assert again.unread == recording.unread
 
 
 def test_a_broken_link_of_a_wheel_does_not_cost_the_vehicles_pose_beside_it(index, tmp_path):
@@ -367,8 +367,8 @@ def test_a_camera_info_that_cannot_be_read_costs_no_set_and_is_told(tmp_path):
     entries = spoiled(sample_entries(3), "/camera/left/camera_info", 1, cut_short)
     recording = build_index(write_rosbag2(tmp_path / "bag", entries), MATCHING)
     assert len(recording) == 3
-    assert "1 refused, the first:" in recording.refused[0]
-    assert "/camera/left/camera_info at" in recording.refused[0]
+    assert "1 refused, the first:" in recording.unread[0]
+    assert "/camera/left/camera_info at" in recording.unread[0]
 
 
 def test_a_camera_without_images_is_refused_by_name(tmp_path):
