@@ -10,9 +10,16 @@ from cvcdepth_core.errors import OutputError
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file that is there whole or as it was before, also when the power fails; OutputError names it."""
+    """Write a file that is there whole or as it was before, also when the power fails; OutputError names it.
+
+    Through a link, what it leads to is written; a pipe or a device, which cannot be replaced, is written as it is.
+    """
+    path = path.resolve()
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
+        if path.exists() and not path.is_file():
+            path.write_bytes(content)
+            return
         with temporary.open("wb") as file:
             file.write(content)
             file.flush()

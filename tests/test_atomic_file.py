@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Results are on the disk whole or not at all."""
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -27,6 +28,21 @@ def test_a_file_is_replaced_as_a_whole_and_nothing_else_is_left(tmp_path):
         write_atomically(path, content)
     assert path.read_bytes() == b"second"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_link_stays_a_link_and_a_pipe_a_pipe(tmp_path):
+    target, link, pipe = tmp_path / "target.yaml", tmp_path / "link.yaml", tmp_path / "pipe"
+    link.symlink_to(target)
+    write_atomically(link, b"written")
+    assert link.is_symlink()
+    assert target.read_bytes() == b"written"
+
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    write_atomically(pipe, b"written")
+    assert os.read(reader, 100) == b"written"
+    os.close(reader)
+    assert pipe.is_fifo()
 
 
 def test_a_full_disk_is_told_by_the_files_name_and_leaves_what_was_there(tmp_path, monkeypatch):
