@@ -14,6 +14,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType
 from recordings import SAMPLE, SAMPLE_MCAP, Entry
 from rosbags.interfaces import QosDurability, QosReliability
+from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionMode, Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -92,6 +93,12 @@ STORAGES = {
         path / "bag.mcap", entries[::-1], use_chunking=False
     ),
     "ros1": lambda path, entries: recordings.ros1_copy(path / "bag.bag"),
+    "ros1 bz2": lambda path, entries: recordings.ros1_copy(
+        path / "bag.bag", compression=Ros1Writer.CompressionFormat.BZ2
+    ),
+    "ros1 lz4": lambda path, entries: recordings.ros1_copy(
+        path / "bag.bag", compression=Ros1Writer.CompressionFormat.LZ4
+    ),
 }
 
 

@@ -30,11 +30,16 @@ from mcap.summary import Summary
 from cvcdepth_ros.bags.ordering import Source, in_time_order
 from cvcdepth_ros.bags.recent_blocks import MESSAGE_BYTES, RecentBlocks
 from cvcdepth_ros.bags.remote import Location, RemotePath
-from cvcdepth_ros.bags.topics import RecordedMessage, RecordingFile, Topic, joined_topics, recorded_qos
+from cvcdepth_ros.bags.topics import (
+    MAX_BLOCK_BYTES,
+    RecordedMessage,
+    RecordingFile,
+    Topic,
+    joined_topics,
+    recorded_qos,
+)
 
 MAGIC = b"\x89MCAP0\r\n"
-MAX_BLOCK_BYTES = 256 * 2**20
-"""Of a record, or of an unpacked chunk; recorders write chunks of 1 to 16 MiB, longer only for a longer message."""
 MAX_BLOCK_RECORDS = 2**20
 _FOOTER_BYTES = 37  # the footer record and the magic after it
 # A window is asked for again and again: for transforms, for CameraInfo, for the pictures of every training sample.

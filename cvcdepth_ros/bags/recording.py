@@ -14,12 +14,19 @@ from rosbags.typesys.store import Typestore
 
 from cvcdepth_core.errors import RecordingError
 from cvcdepth_ros.bags import mcap_file, ros1_file, sqlite_file
-from cvcdepth_ros.bags.mcap_file import MAX_BLOCK_BYTES, McapFile, unpack_zstd
+from cvcdepth_ros.bags.mcap_file import McapFile, unpack_zstd
 from cvcdepth_ros.bags.ordering import Source, in_time_order
 from cvcdepth_ros.bags.remote import Location, RemotePath, location
 from cvcdepth_ros.bags.ros1_file import Ros1File
 from cvcdepth_ros.bags.sqlite_file import SqliteFile
-from cvcdepth_ros.bags.topics import STORAGE_SUFFIXES, RecordedMessage, RecordingFile, Topic, joined_topics
+from cvcdepth_ros.bags.topics import (
+    MAX_BLOCK_BYTES,
+    STORAGE_SUFFIXES,
+    RecordedMessage,
+    RecordingFile,
+    Topic,
+    joined_topics,
+)
 from cvcdepth_ros.bags.typestores import typestore_for
 
 _LOCAL_READERS: dict[bytes, Callable[[Path], RecordingFile]] = {

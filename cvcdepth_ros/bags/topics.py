@@ -15,6 +15,8 @@ from cvcdepth_ros.bags.remote import Location
 
 STORAGE_SUFFIXES = (".mcap", ".db3", ".bag", ".mcap.zstd", ".db3.zstd")
 """How the names of storage files end; a file that is named itself may end otherwise."""
+MAX_BLOCK_BYTES = 256 * 2**20
+"""Of a record, or of an unpacked chunk; recorders write chunks of 1 to 16 MiB, longer only for a longer message."""
 
 
 class RecordedMessage(NamedTuple):

@@ -5,6 +5,7 @@ Nothing may execute, hang or take memory without measure; the answer is one line
 The table in docs/reliability.md is made of these names (`--fault-table FILE`).
 """
 
+import bz2
 import json
 import os
 import pickle
@@ -86,22 +87,43 @@ def _chunk_file(path: Path, chunks: list[Chunk]) -> Path:
     return path
 
 
-def _bomb(compression: str, announced: int | None = None) -> Callable[[Path, list[Entry]], Path]:
-    """A chunk of a few kilobytes that unpacks to 2 GiB."""
+def _packed_zeros(compression: str) -> bytes:
+    """A few kilobytes that unpack to 2 GiB."""
+    piece, count = bytes(16 * MIB), 128
+    if compression == "zstd":
+        packer = zstandard.ZstdCompressor().compressobj()
+        return b"".join(packer.compress(piece) for _ in range(count)) + packer.flush()
+    if compression == "bz2":  # streams one behind the other are one
+        return bz2.compress(piece) * count
+    with lz4.frame.LZ4FrameCompressor() as packer:
+        return packer.begin() + b"".join(packer.compress(piece) for _ in range(count)) + packer.flush()
 
+
+def _bomb(compression: str, announced: int = 2048 * MIB) -> Callable[[Path, list[Entry]], Path]:
     def make(folder: Path, sample: list[Entry]) -> Path:
-        size = 2048 * MIB
-        if compression == "zstd":
-            packer = zstandard.ZstdCompressor().compressobj()
-            packed = b"".join(packer.compress(bytes(16 * MIB)) for _ in range(128)) + packer.flush()
-        else:
-            with lz4.frame.LZ4FrameCompressor() as packer:
-                packed = packer.begin() + b"".join(packer.compress(bytes(16 * MIB)) for _ in range(128))
-                packed += packer.flush()
-        chunk = Chunk(compression, packed, 10, 0, 0, size if announced is None else announced)
+        chunk = Chunk(compression, _packed_zeros(compression), 10, 0, 0, announced)
         return _chunk_file(folder / "bomb.mcap", [chunk])
 
     return make
+
+
+def _ros1_bomb(compression: str, announced: int = 2048 * MIB) -> Callable[[Path, list[Entry]], Path]:
+    def make(folder: Path, sample: list[Entry]) -> Path:
+        return recordings.ros1_chunk(folder / "bomb.bag", compression, announced, _packed_zeros(compression))
+
+    return make
+
+
+def _large_ros1_header(folder: Path, sample: list[Entry]) -> Path:
+    with (folder / "a.bag").open("wb") as stream:
+        stream.write(b"#ROSBAG V2.0\n" + struct.pack("<I", 1100 * MIB))
+        stream.truncate(1200 * MIB)  # of nothing, which takes no place on disk
+    return folder / "a.bag"
+
+
+def _repeated_ros1_index(folder: Path, sample: list[Entry]) -> Path:
+    """Nine million messages in 400 kB: the index lists one chunk and its thirty thousand messages again and again."""
+    return recordings.ros1_chunk(folder / "a.bag", "none", 1, b"a", messages=30_000, times=300)
 
 
 def _million_records(folder: Path, sample: list[Entry]) -> Path:
@@ -299,6 +321,14 @@ FAULTS = {
     "chunk that unpacks to 2 GiB (lz4)": Fault(_inspected(_bomb("lz4")), 1, "at most 268435456 are read at once"),
     "the same in lz4, announced as 1 kB": Fault(_inspected(_bomb("lz4", 1000)), 1, "chunk at byte 8 skipped"),
     "chunk that announces 2^62 bytes": Fault(_inspected(_bomb("lz4", 2**62)), 1, "at most 268435456 are read"),
+    "ROS 1 chunk that unpacks to 2 GiB (bz2)": Fault(_inspected(_ros1_bomb("bz2")), 0, "at most 268435456 are read"),
+    "the same in bz2, announced as 1 kB": Fault(_inspected(_ros1_bomb("bz2", 1000)), 0, "does not hold the 1000 bytes"),
+    "ROS 1 chunk that unpacks to 2 GiB (lz4)": Fault(_inspected(_ros1_bomb("lz4")), 0, "at most 268435456 are read"),
+    "ROS 1 chunk in lz4, announced as 1 kB": Fault(
+        _inspected(_ros1_bomb("lz4", 1000)), 0, "does not hold the 1000 bytes"
+    ),
+    "ROS 1 header of 1 GiB": Fault(_inspected(_large_ros1_header), 1, "record of 1153433600 bytes at byte 17"),
+    "ROS 1 index that repeats itself": Fault(_inspected(_repeated_ros1_index), 1, "they overlap"),
     "three million records in a chunk": Fault(_inspected(_million_records), 1, "more than 1048576 records"),
     "a hundred chunks at the same time": Fault(_inspected(_overlapping), 0, "bytes at the same time"),
     "index that leads to the messages": Fault(_inspected(_summary_of_chunks), 0, '"intact"'),
