@@ -3,7 +3,10 @@
 
 import re
 import shutil
+import sqlite3
+import sys
 import tracemalloc
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +22,7 @@ from rosbags.rosbag2 import CompressionMode, Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from cvcdepth_core.errors import RecordingError
-from cvcdepth_ros.bags import LATCHED, RecordedMessage, RecordingWriter, open_recording, typestore
+from cvcdepth_ros.bags import LATCHED, RecordedMessage, RecordingWriter, open_recording, sqlite_file, typestore
 
 SECOND = 10**9
 
@@ -226,6 +229,30 @@ def test_the_write_ahead_log_of_a_crashed_recorder_is_read(sample: list[Entry], 
     before = sorted(file.name for file in tmp_path.iterdir()), path.read_bytes()
     assert stamps(read(path)) == stamps(as_messages(sample))
     assert (sorted(file.name for file in tmp_path.iterdir()), path.read_bytes()) == before, "nothing is changed"
+
+
+def test_a_message_beyond_measure_in_a_database_costs_only_itself(
+    sample: list[Entry], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(sqlite_file, "MAX_BLOCK_BYTES", 1_000_000)
+    path = recordings.sqlite_copy(tmp_path / "bag")
+    with closing(sqlite3.connect(path / "bag.db3")) as database:
+        database.execute("UPDATE messages SET data = zeroblob(?) WHERE id = 3", (1_000_001,))
+        database.commit()
+    with open_recording(path) as recording:
+        assert stamps(list(recording.messages())) == stamps(as_messages([*sample[:2], *sample[3:]]))
+        assert f"{sample[2].topic} at {sample[2].log_time} ns skipped: 1000001 bytes" in (recording.damage or "")
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="sqlite3 has no limits")
+def test_a_name_beyond_measure_in_a_database_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sqlite_file, "MAX_BLOCK_BYTES", 100_000)
+    path = recordings.sqlite_copy(tmp_path / "bag")
+    with closing(sqlite3.connect(path / "bag.db3")) as database:
+        database.execute("UPDATE topics SET type = ? WHERE id = 1", ("x" * 200_000,))
+        database.commit()
+    with pytest.raises(RecordingError, match=r"bag.db3: not readable as a rosbag2 database: string or blob too big"):
+        open_recording(path)
 
 
 def test_one_damaged_file_of_a_split_recording_costs_only_itself(tmp_path: Path):

@@ -347,6 +347,11 @@ FAULTS = {
     ),
     "timestamps that are text": Fault(_inspected(_sqlite("UPDATE messages SET timestamp = 'soon'")), 1, "not integers"),
     "messages that are numbers": Fault(_inspected(_sqlite("UPDATE messages SET data = 7")), 0, "was skipped"),
+    "message of 257 MiB": Fault(
+        _inspected(_sqlite(f"UPDATE messages SET data = zeroblob({257 * MIB}) WHERE id = 1")),
+        0,
+        "269484032 bytes; at most 268435456 are read at once",
+    ),
     "transforms in a loop": Fault(_transforms(_loop), 1, "closes a loop"),
     "quaternion of length 7": Fault(_transforms(_not_a_unit), 1, "has norm 7"),
     "translation that is no number": Fault(_transforms(_not_a_number), 1, "want 3 + 4 finite numbers"),
