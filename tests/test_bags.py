@@ -118,6 +118,15 @@ def test_every_storage_gives_the_same_messages_in_time_order(storage: str, sampl
         assert recording.damage is None
 
 
+def test_compressed_files_of_the_same_name_from_two_folders_are_both_read(sample: list[Entry], tmp_path: Path):
+    packed = []
+    for half, entries in {"first": sample[:20], "second": sample[20:]}.items():
+        (tmp_path / half).mkdir()
+        mcap = recordings.write_mcap(tmp_path / f"{half}.mcap", entries)
+        packed.append(recordings.zstd_file(mcap, tmp_path / half / "bag.mcap.zstd"))
+    assert stamps(read(packed)) == stamps(as_messages(sample))
+
+
 @pytest.mark.parametrize("storage", ["folder", "sqlite folder", "split folder", "ros1"])
 def test_the_latched_transforms_are_known_as_latched(storage: str, sample: list[Entry], tmp_path: Path):
     with open_recording(STORAGES[storage](tmp_path, sample)) as recording:

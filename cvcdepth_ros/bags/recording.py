@@ -4,7 +4,7 @@
 from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import cached_property, partial
 from pathlib import Path, PurePath
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, mkdtemp
 from typing import IO, Any
 
 import yaml
@@ -30,6 +30,7 @@ from cvcdepth_ros.bags.topics import (
 from cvcdepth_ros.bags.typestores import typestore_for
 
 _LOCAL_READERS: dict[bytes, Callable[[Path], RecordingFile]] = {
+    mcap_file.MAGIC: McapFile,
     sqlite_file.MAGIC: SqliteFile,
     ros1_file.MAGIC: Ros1File,
 }
@@ -219,25 +220,21 @@ class Recording:
 
     def _open_file(self, path: Location) -> RecordingFile:
         try:
-            with path.open("rb") as stream:
-                beginning = stream.read(16)
-            if beginning.startswith(mcap_file.MAGIC):
-                return McapFile(path)
+            beginning = _beginning(path)
             if isinstance(path, RemotePath):
-                raise RecordingError(f"{path}: {_begins(beginning)}; behind a URL only MCAP can be read, by seeking")
-            if beginning.startswith(_ZSTD_MAGIC):
-                return self._open_file(self._unpack(path))
-            for magic, reader in _LOCAL_READERS.items():
-                if beginning.startswith(magic):
-                    return reader(path)
+                return _remote_reader(path, beginning)
+            if not beginning.startswith(_ZSTD_MAGIC):
+                return _local_reader(path, beginning, str(path))
+            # Once: each layer of a file packed again and again may multiply its size by as much.
+            unpacked = self._unpack(path)
+            return _local_reader(unpacked, _beginning(unpacked), f"{path} (unpacked)")
         except OSError as error:
             raise RecordingError(f"{path}: {error.strerror or error}") from error
-        raise RecordingError(f"{path}: {_begins(beginning)}; an MCAP, SQLite or ROS 1 recording was expected")
 
     def _unpack(self, path: Path) -> Path:
-        """Unpack a file that was compressed as a whole into a temporary folder."""
+        """Unpack a file that was compressed as a whole into a folder of its own: others may have the same name."""
         self._unpacked = self._unpacked or TemporaryDirectory(prefix="cvcdepth_")
-        target = Path(self._unpacked.name) / path.stem
+        target = Path(mkdtemp(dir=self._unpacked.name)) / path.stem
         try:
             with zstandard.open(path, "rb") as packed, target.open("wb") as unpacked:
                 _copy(packed, unpacked, _MAX_EXPANSION * path.stat().st_size)
@@ -246,11 +243,29 @@ class Recording:
         return target
 
 
+def _remote_reader(path: RemotePath, beginning: bytes) -> RecordingFile:
+    if not beginning.startswith(mcap_file.MAGIC):
+        raise RecordingError(f"{path}: {_begins(beginning)}; behind a URL only MCAP can be read, by seeking")
+    return McapFile(path)
+
+
+def _local_reader(path: Path, beginning: bytes, where: str) -> RecordingFile:
+    for magic, reader in _LOCAL_READERS.items():
+        if beginning.startswith(magic):
+            return reader(path)
+    raise RecordingError(f"{where}: {_begins(beginning)}; an MCAP, SQLite or ROS 1 recording was expected")
+
+
 def _copy(packed: IO[bytes], unpacked: IO[bytes], most: int) -> None:
     while piece := packed.read(_PIECE_BYTES):
         if unpacked.tell() + len(piece) > most:
             raise zstandard.ZstdError(f"unpacks to more than {most} bytes, {_MAX_EXPANSION} times its size")
         unpacked.write(piece)
+
+
+def _beginning(path: Location) -> bytes:
+    with path.open("rb") as stream:
+        return stream.read(16)
 
 
 def _begins(beginning: bytes) -> str:

@@ -192,6 +192,11 @@ def _packed_file(folder: Path, sample: list[Entry]) -> Path:
     return folder / "bag.mcap.zstd"
 
 
+def _file_packed_twice(folder: Path, sample: list[Entry]) -> Path:
+    once = recordings.zstd_file(_mcap(folder, sample), folder / "once.mcap.zstd")
+    return recordings.zstd_file(once, folder / "twice.mcap.zstd")
+
+
 def _sqlite(*statements: str) -> Callable[[Path, list[Entry]], Path]:
     def make(folder: Path, sample: list[Entry]) -> Path:
         path = recordings.sqlite_copy(folder / "bag", sets=1) / "bag.db3"
@@ -337,6 +342,7 @@ FAULTS = {
     "type of an unknown type": Fault(_inspected(_defined_as("y/B b\n")), 0, '"/a"'),
     "message that unpacks to 1 GiB": Fault(_inspected(_packed_message), 0, "unpacks to more than 268435456 bytes"),
     "file that unpacks to 1 GiB of zeros": Fault(_inspected(_packed_file), 1, "500 times its size"),
+    "file that was packed twice": Fault(_inspected(_file_packed_twice), 1, "twice.mcap.zstd (unpacked): begins with"),
     "view that goes on for ever": Fault(
         _inspected(_sqlite("DROP TABLE messages", _ENDLESS)), 1, "messages is no plain table"
     ),
