@@ -167,15 +167,23 @@ def _summary_of_chunks(folder: Path, sample: list[Entry]) -> Path:
     return path
 
 
+def _offered_as(profiles: str) -> Callable[[Path, list[Entry]], Path]:
+    """One topic's publishers offer this as QoS."""
+    return _with_topic(b"", {"offered_qos_profiles": profiles})
+
+
 def _defined_as(definition: str) -> Callable[[Path, list[Entry]], Path]:
     """The type of one topic is unknown and defined so by the recording."""
+    return _with_topic(definition.encode(), {})
 
+
+def _with_topic(definition: bytes, metadata: dict[str, str]) -> Callable[[Path, list[Entry]], Path]:
     def make(folder: Path, sample: list[Entry]) -> Path:
         with (folder / "a.mcap").open("wb") as stream:
             writer = mcap.writer.Writer(stream)
             writer.start(profile="ros2")
-            schema = writer.register_schema("x/msg/A", "ros2msg", definition.encode())
-            writer.add_message(writer.register_channel("/a", "cdr", schema), 5, bytes(64), 5)
+            schema = writer.register_schema("x/msg/A", "ros2msg", definition)
+            writer.add_message(writer.register_channel("/a", "cdr", schema, metadata), 5, bytes(64), 5)
             writer.finish()
         return folder / "a.mcap"
 
@@ -295,6 +303,12 @@ _LAUGHS = "a0: &a0 [ha, ha, ha, ha, ha, ha, ha, ha, ha]\n" + "".join(
 )
 
 
+def _merges(levels: int) -> str:
+    """Mappings, each merged from nine times the one before it."""
+    merged = (f"a{n}: &a{n} {{<<: [{', '.join([f'*a{n - 1}'] * 9)}]}}\n" for n in range(1, levels))
+    return "a0: &a0 {ha: ha}\n" + "".join(merged)
+
+
 class _Executes:
     def __reduce__(self) -> tuple[Any, ...]:
         return os.system, (f"touch {_Executes.marker}",)
@@ -340,6 +354,9 @@ FAULTS = {
     "type defined by itself": Fault(_inspected(_defined_as("A a\n")), 0, '"/a"'),
     "type with 2 million strings": Fault(_inspected(_defined_as("string[2000000] a\n")), 0, '"/a"'),
     "type of an unknown type": Fault(_inspected(_defined_as("y/B b\n")), 0, '"/a"'),
+    "QoS with a date that is none": Fault(_inspected(_offered_as("- 2001-99-99")), 0, '"/a"'),
+    "QoS nested 100 000 deep": Fault(_inspected(_offered_as("[" * 100_000)), 0, '"/a"'),
+    "QoS with 43 million merged entries": Fault(_inspected(_offered_as(_merges(9))), 0, '"/a"'),
     "message that unpacks to 1 GiB": Fault(_inspected(_packed_message), 0, "unpacks to more than 268435456 bytes"),
     "file that unpacks to 1 GiB of zeros": Fault(_inspected(_packed_file), 1, "500 times its size"),
     "file that was packed twice": Fault(_inspected(_file_packed_twice), 1, "twice.mcap.zstd (unpacked): begins with"),
