@@ -27,7 +27,7 @@ import recordings
 import yaml
 import zstandard
 from mcap.data_stream import RecordBuilder
-from mcap.records import Chunk
+from mcap.records import Chunk, Schema
 from mcap.writer import CompressionType
 from recordings import SAMPLE_MCAP, Entry
 
@@ -130,6 +130,33 @@ def _million_records(folder: Path, sample: list[Entry]) -> Path:
     records = struct.pack("<BQHIQQ", 5, 22, 1, 0, 0, 0) * 3_000_000
     chunk = Chunk("zstd", zstandard.compress(records), 10, 0, 0, len(records))
     return _chunk_file(folder / "records.mcap", [chunk])
+
+
+def _definitions(number: int, size: int) -> Callable[[Path, list[Entry]], Path]:
+    """Chunks with one definition each; all are kept until the last message is read."""
+
+    def make(folder: Path, sample: list[Entry]) -> Path:
+        return _chunk_file(folder / "definitions.mcap", [_definition(id_, size) for id_ in range(1, number + 1)])
+
+    return make
+
+
+def _definition(id_: int, size: int) -> Chunk:
+    builder = RecordBuilder()
+    Schema(id=id_, name="x/msg/A", encoding="ros2msg", data=bytes(size)).write(builder)
+    content = builder.end()
+    return Chunk("zstd", zstandard.compress(content), 10, 0, 0, len(content))
+
+
+def _large_summary(folder: Path, sample: list[Entry]) -> Path:
+    """The index describes something with 65 MiB of text."""
+    with (folder / "a.mcap").open("wb") as stream:
+        writer = mcap.writer.Writer(stream)
+        writer.start(profile="ros2")
+        schema = writer.register_schema("x/msg/A", "ros2msg", b"")
+        writer.add_message(writer.register_channel("/a", "cdr", schema, {"a": "a" * 65 * MIB}), 5, bytes(64), 5)
+        writer.finish()
+    return folder / "a.mcap"
 
 
 def _overlapping(folder: Path, sample: list[Entry]) -> Path:
@@ -349,6 +376,9 @@ FAULTS = {
     "ROS 1 header of 1 GiB": Fault(_inspected(_large_ros1_header), 1, "record of 1153433600 bytes at byte 17"),
     "ROS 1 index that repeats itself": Fault(_inspected(_repeated_ros1_index), 1, "they overlap"),
     "three million records in a chunk": Fault(_inspected(_million_records), 1, "more than 1048576 records"),
+    "25 definitions of 60 MiB": Fault(_inspected(_definitions(25, 60 * MIB)), 1, "topics and types of more than 67"),
+    "definition of 65 MiB": Fault(_inspected(_definitions(1, 65 * MIB)), 1, "topics and types of more than 67108864"),
+    "channel of 65 MiB": Fault(_inspected(_large_summary), 1, "index unreadable (topics and types of more than 67"),
     "a hundred chunks at the same time": Fault(_inspected(_overlapping), 0, "bytes at the same time"),
     "index that leads to the messages": Fault(_inspected(_summary_of_chunks), 0, '"intact"'),
     "type defined by itself": Fault(_inspected(_defined_as("A a\n")), 0, '"/a"'),
