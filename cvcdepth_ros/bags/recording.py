@@ -13,6 +13,7 @@ from rosbags.serde import SerdeError
 from rosbags.typesys.store import Typestore
 
 from cvcdepth_core.errors import RecordingError
+from cvcdepth_core.yaml_text import load_yaml
 from cvcdepth_ros.bags import mcap_file, ros1_file, sqlite_file
 from cvcdepth_ros.bags.mcap_file import McapFile, unpack_zstd
 from cvcdepth_ros.bags.ordering import Source, in_time_order
@@ -198,9 +199,9 @@ class Recording:
             self._damage.append(f"{folder}: no metadata.yaml, reading all files of the folder")
             return []
         try:
-            names = yaml.safe_load(metadata.read_text())["rosbag2_bagfile_information"]["relative_file_paths"]
+            names = load_yaml(metadata.read_text())["rosbag2_bagfile_information"]["relative_file_paths"]
             return [folder / PurePath(name).name for name in names]
-        except (yaml.YAMLError, ValueError, KeyError, TypeError, RecursionError) as error:
+        except (yaml.YAMLError, ValueError, LookupError, TypeError) as error:
             self._damage.append(f"{metadata}: unreadable ({type(error).__name__}), reading all files of the folder")
             return []
 

@@ -24,7 +24,6 @@ import mcap.writer
 import numpy as np
 import pytest
 import recordings
-import yaml
 import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.records import Chunk, Schema
@@ -227,6 +226,15 @@ def _packed_file(folder: Path, sample: list[Entry]) -> Path:
     return folder / "bag.mcap.zstd"
 
 
+def _with_metadata(text: str) -> Callable[[Path, list[Entry]], Path]:
+    def make(folder: Path, sample: list[Entry]) -> Path:
+        bag = recordings.write_rosbag2(folder / "bag", sample)
+        (bag / "metadata.yaml").write_text(text)
+        return bag
+
+    return make
+
+
 def _file_packed_twice(folder: Path, sample: list[Entry]) -> Path:
     once = recordings.zstd_file(_mcap(folder, sample), folder / "once.mcap.zstd")
     return recordings.zstd_file(once, folder / "twice.mcap.zstd")
@@ -390,6 +398,9 @@ FAULTS = {
     "message that unpacks to 1 GiB": Fault(_inspected(_packed_message), 0, "unpacks to more than 268435456 bytes"),
     "file that unpacks to 1 GiB of zeros": Fault(_inspected(_packed_file), 1, "500 times its size"),
     "file that was packed twice": Fault(_inspected(_file_packed_twice), 1, "twice.mcap.zstd (unpacked): begins with"),
+    "metadata.yaml with 43 million merged entries": Fault(
+        _inspected(_with_metadata(_merges(9))), 0, "metadata.yaml: unreadable (YAMLError)"
+    ),
     "view that goes on for ever": Fault(
         _inspected(_sqlite("DROP TABLE messages", _ENDLESS)), 1, "messages is no plain table"
     ),
@@ -416,6 +427,8 @@ FAULTS = {
     "YAML that is no rig": Fault(_rig("- a\n- b\n"), 1, "rig.yaml"),
     "YAML that is no YAML": Fault(_rig("a: [\n"), 1, "cannot be read"),
     "YAML with a billion words": Fault(_rig(f"{_LAUGHS}cameras: *a9\n"), 1, "rig.yaml"),
+    "YAML with 43 million merged entries": Fault(_rig(_merges(9)), 1, "more than 10000 entries are merged (<<)"),
+    "YAML with a time that is none": Fault(_rig("!!timestamp soon"), 1, "cannot be read"),
     "YAML nested 100 000 deep": Fault(_rig("[" * 100_000), 1, "rig.yaml"),
     "YAML that calls a function": Fault(_rig("!!python/object/apply:os.system [touch executed]"), 1, "cannot be read"),
     "checkpoint that executes (pickle)": Fault(_checkpoint("model.pth", None), 1, "model.pth"),
@@ -455,11 +468,6 @@ def test_the_tool_meets_the_fault_with_one_line_or_a_result_that_tells_it(
         else f"exit 0, tells `{fault.says}`"
     )
     fault_table.add(name, f"`cvcdepth {arguments[0]}`", answer, time.monotonic() - clock)
-
-
-def test_a_rig_files_tags_name_no_functions():
-    with pytest.raises(yaml.YAMLError):
-        yaml.safe_load("!!python/object/apply:os.system [true]")
 
 
 def _peak_mib() -> float:
