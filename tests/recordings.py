@@ -198,11 +198,19 @@ def ros1_copy(path: Path, sets: int = 10, compression: Ros1Writer.CompressionFor
     return path
 
 
-def ros1_chunk(path: Path, compression: str, size: int, packed: bytes, messages: int = 1, times: int = 1) -> Path:
+def ros1_chunk(
+    path: Path,
+    compression: str,
+    size: int,
+    packed: bytes,
+    messages: int = 1,
+    times: int = 1,
+    definition: str = "string data\n",
+) -> Path:
     """A ROS 1 bag with one chunk, announced to unpack to `size` bytes, that its index lists so many times."""
     chunk = _ros1_record(packed, op=b"\5", compression=compression.encode(), size=_u32(size))
     entries = _ros1_record(bytes(12) * messages, ver=_u32(1), conn=_u32(0), count=_u32(messages), op=b"\4")
-    fields = {"topic": b"/a", "type": b"std_msgs/String", "md5sum": b"*", "message_definition": b"string data\n"}
+    fields = {"topic": b"/a", "type": b"x/A", "md5sum": b"*", "message_definition": definition.encode()}
     connection = _ros1_record(_ros1_header(**fields), op=b"\7", conn=_u32(0), topic=b"/a")
     known = {"op": b"\3", "conn_count": _u32(1), "chunk_count": _u32(times)}
     start = len(b"#ROSBAG V2.0\n" + _ros1_record(b"", **known, index_pos=bytes(8)))
@@ -212,6 +220,11 @@ def ros1_chunk(path: Path, compression: str, size: int, packed: bytes, messages:
     beginning = b"#ROSBAG V2.0\n" + _ros1_record(b"", **known, index_pos=index)
     path.write_bytes(beginning + chunk + entries + connection + infos)
     return path
+
+
+def ros1_message(data: bytes) -> bytes:
+    """The first message in the chunk of a ROS 1 bag."""
+    return _ros1_record(data, op=b"\2", conn=_u32(0), time=bytes(8))
 
 
 def _ros1_record(data: bytes, **fields: bytes) -> bytes:

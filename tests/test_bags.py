@@ -23,6 +23,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from cvcdepth_core.errors import RecordingError
 from cvcdepth_ros.bags import LATCHED, RecordedMessage, RecordingWriter, open_recording, sqlite_file, typestore
+from cvcdepth_ros.bags.typestores import parsed_definition
 
 SECOND = 10**9
 
@@ -399,6 +400,22 @@ def test_the_recordings_own_definition_of_a_common_type_wins(tmp_path: Path):
     path = custom_recording(tmp_path / "bag", "sensor_msgs/msg/Temperature", "float64 celsius\n", celsius=21.5)
     with open_recording(path) as recording:
         assert recording.deserialize(next(recording.messages())).celsius == 21.5
+
+
+@pytest.mark.parametrize(
+    ("nothing", "something"),
+    [
+        ("int32[0] a", "int32[1] a"),
+        ("std_msgs/Empty a", "std_msgs/Bool a"),
+        ("y/C a", "y/D a"),
+        ("y/C[3] a", "y/D[3] a"),
+    ],
+)
+def test_a_sequence_whose_elements_have_no_bytes_is_not_used(nothing: str, something: str):
+    line = "=" * 80
+    definition = f"y/B[] a\n{line}\nMSG: y/B\n%s\n{line}\nMSG: y/C\n{line}\nMSG: y/D\nbool a\n"
+    assert parsed_definition(definition % nothing, "x/msg/A") == {}
+    assert parsed_definition(definition % something, "x/msg/A").keys() > {"x/msg/A", "y/msg/B"}
 
 
 def test_a_message_too_short_for_its_type_is_named(sample: list[Entry], tmp_path: Path):

@@ -148,7 +148,9 @@ def _unpacked(position: int, compression: str, size: int, packed: bytes) -> byte
 def _topic(connection: Connection) -> Topic:
     types = parsed_definition(connection.msgdef.data, connection.msgtype)
     if connection.msgtype not in types:
-        raise TypesysError(f"that of {connection.msgtype}, which is not complete or no definition")
+        raise TypesysError(
+            f"that of {connection.msgtype}, which is not complete, has elements without bytes, or is none"
+        )
     types.update({name: typestore().fielddefs[name] for name in _ROS2_TYPES})
     store = get_typestore(Stores.EMPTY)
     store.register(types)

@@ -125,6 +125,16 @@ def _repeated_ros1_index(folder: Path, sample: list[Entry]) -> Path:
     return recordings.ros1_chunk(folder / "a.bag", "none", 1, b"a", messages=30_000, times=300)
 
 
+def _ros1_nothings(definition: str) -> Callable[[Path, list[Entry]], Path]:
+    """A ROS 1 message of four bytes: the number of its elements."""
+
+    def make(folder: Path, sample: list[Entry]) -> Path:
+        content = recordings.ros1_message(struct.pack("<I", 300_000_000))
+        return recordings.ros1_chunk(folder / "a.bag", "none", len(content), content, definition=definition)
+
+    return make
+
+
 def _million_records(folder: Path, sample: list[Entry]) -> Path:
     records = struct.pack("<BQHIQQ", 5, 22, 1, 0, 0, 0) * 3_000_000
     chunk = Chunk("zstd", zstandard.compress(records), 10, 0, 0, len(records))
@@ -383,6 +393,9 @@ FAULTS = {
     ),
     "ROS 1 header of 1 GiB": Fault(_inspected(_large_ros1_header), 1, "record of 1153433600 bytes at byte 17"),
     "ROS 1 index that repeats itself": Fault(_inspected(_repeated_ros1_index), 1, "they overlap"),
+    "ROS 1 message of 300 million nothings": Fault(
+        _inspected(_ros1_nothings(f"y/B[] a\n{'=' * 80}\nMSG: y/B\n")), 1, "elements without bytes"
+    ),
     "three million records in a chunk": Fault(_inspected(_million_records), 1, "more than 1048576 records"),
     "25 definitions of 60 MiB": Fault(_inspected(_definitions(25, 60 * MIB)), 1, "topics and types of more than 67"),
     "definition of 65 MiB": Fault(_inspected(_definitions(1, 65 * MIB)), 1, "topics and types of more than 67108864"),
