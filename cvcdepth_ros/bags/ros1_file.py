@@ -91,7 +91,8 @@ class _BoundedReader(Reader):
     """rosbags' reader, which alone believes whatever sizes a file declares."""
 
     def __init__(self, path: Path) -> None:
-        super().__init__(_BoundedPath(path))
+        super().__init__(path)
+        self.path = _BoundedPath(path)
         self._unread = path.stat().st_size
 
     def read_chunk(self) -> Chunk:
