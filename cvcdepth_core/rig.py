@@ -22,6 +22,7 @@ from cvcdepth_core.atomic_file import write_atomically
 from cvcdepth_core.calibration import Calibration, first_validation_message
 from cvcdepth_core.errors import RigError, TransformError
 from cvcdepth_core.poses import Pose, check_rigid, pose_from_quaternion, quaternion_from_rotation
+from cvcdepth_core.yaml_text import load_yaml
 
 MIN_NEIGHBOUR_OVERLAP_DEG = 2.0
 """Cameras whose images share a narrower strip than this are no neighbours: its pixels are too few to learn from."""
@@ -285,8 +286,8 @@ def order_around_vehicle(base_T_cameras: Mapping[str, Pose]) -> list[str]:
 def load_rig_layout(path: Path) -> RigLayout:
     """Read a rig file. RigError names the file, the field and the value that is wrong."""
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError, ValueError) as error:
+        content = load_yaml(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         reason = " ".join(str(error).split())
         raise RigError(f"rig file {path}: cannot be read: {reason}") from error
     try:

@@ -16,6 +16,7 @@ from cvcdepth_core.errors import ConfigError
 from cvcdepth_core.networks import EncoderName
 from cvcdepth_core.objective import ObjectiveConfig
 from cvcdepth_core.surround_model import PoseMethod
+from cvcdepth_core.yaml_text import load_yaml
 
 ExposureMotion = Literal["auto", "recorded", "network", "none"]
 
@@ -189,7 +190,7 @@ def _read_with_bases(path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
 
 def _read_yaml(path: Path) -> dict[str, Any]:
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = load_yaml(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise ConfigError(f"{path}: cannot be read: {' '.join(str(error).split())}") from error
     if not isinstance(content, dict):

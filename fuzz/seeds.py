@@ -108,6 +108,9 @@ def _recordings() -> Iterator[tuple[str, bytes]]:
     with tempfile.TemporaryDirectory() as folder:
         yield "sqlite", _sqlite(Path(folder) / "bag")
         yield "ros1", _ros1(Path(folder) / "a.bag")
+        for compression in Ros1Writer.CompressionFormat:
+            name = compression.name.lower()
+            yield f"ros1_{name}", _ros1(Path(folder) / f"{name}.bag", compression)
 
 
 def _mcap(definition: bytes = b"", **options: object) -> bytes:
@@ -136,9 +139,12 @@ def _sqlite(path: Path) -> bytes:
     return file.read_bytes()
 
 
-def _ros1(path: Path) -> bytes:
+def _ros1(path: Path, compression: Ros1Writer.CompressionFormat | None = None) -> bytes:
     NOETIC.register({"tf2_msgs/msg/TFMessage": JAZZY.fielddefs["tf2_msgs/msg/TFMessage"]})
-    with Ros1Writer(path) as writer:
+    writer = Ros1Writer(path)
+    if compression:
+        writer.set_compression(compression)
+    with writer:
         for time, (topic, type_name, cdr) in enumerate(_topics()[:2]):
             connection = writer.add_connection(topic, type_name, typestore=NOETIC)
             writer.write(connection, time, NOETIC_FROM_CDR(cdr, type_name))

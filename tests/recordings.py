@@ -7,6 +7,7 @@ They are made with rosbags, mcap and sqlite3, never with our own reader or write
 import itertools
 import shutil
 import sqlite3
+import struct
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
@@ -186,11 +187,14 @@ def sqlite_copy(path: Path, sets: int = 10) -> Path:
     return write_rosbag2(path, sample_entries(sets), StoragePlugin.SQLITE3)
 
 
-def ros1_copy(path: Path, sets: int = 10) -> Path:
+def ros1_copy(path: Path, sets: int = 10, compression: Ros1Writer.CompressionFormat | None = None) -> Path:
     """The sample as a ROS 1 bag."""
     noetic = get_typestore(Stores.ROS1_NOETIC)
     noetic.register({"tf2_msgs/msg/TFMessage": JAZZY.fielddefs["tf2_msgs/msg/TFMessage"]})
-    with Ros1Writer(path) as writer:
+    writer = Ros1Writer(path)
+    if compression:
+        writer.set_compression(compression)
+    with writer:
         connections: dict[str, Any] = {}
         for entry in sample_entries(sets):
             if entry.topic not in connections:
@@ -201,6 +205,50 @@ def ros1_copy(path: Path, sets: int = 10) -> Path:
             raw = JAZZY.cdr_to_ros1(entry.cdr, entry.type)
             writer.write(connections[entry.topic], entry.log_time, raw)
     return path
+
+
+def ros1_chunk(
+    path: Path,
+    compression: str,
+    size: int,
+    packed: bytes,
+    messages: int = 1,
+    times: int = 1,
+    definition: str = "string data\n",
+) -> Path:
+    """A ROS 1 bag with one chunk, announced to unpack to `size` bytes, that its index lists so many times."""
+    chunk = _ros1_record(packed, op=b"\5", compression=compression.encode(), size=_u32(size))
+    entries = _ros1_record(bytes(12) * messages, ver=_u32(1), conn=_u32(0), count=_u32(messages), op=b"\4")
+    fields = {"topic": b"/a", "type": b"x/A", "md5sum": b"*", "message_definition": definition.encode()}
+    connection = _ros1_record(_ros1_header(**fields), op=b"\7", conn=_u32(0), topic=b"/a")
+    known = {"op": b"\3", "conn_count": _u32(1), "chunk_count": _u32(times)}
+    start = len(b"#ROSBAG V2.0\n" + _ros1_record(b"", **known, index_pos=bytes(8)))
+    info = {"op": b"\6", "ver": _u32(1), "chunk_pos": struct.pack("<Q", start), "count": _u32(1)}
+    infos = _ros1_record(_u32(0) + _u32(messages), **info, start_time=bytes(8), end_time=bytes(8)) * times
+    index = struct.pack("<Q", start + len(chunk) + len(entries))
+    beginning = b"#ROSBAG V2.0\n" + _ros1_record(b"", **known, index_pos=index)
+    path.write_bytes(beginning + chunk + entries + connection + infos)
+    return path
+
+
+def ros1_message(data: bytes) -> bytes:
+    """The first message in the chunk of a ROS 1 bag."""
+    return _ros1_record(data, op=b"\2", conn=_u32(0), time=bytes(8))
+
+
+def _ros1_record(data: bytes, **fields: bytes) -> bytes:
+    """One record of a ROS 1 bag."""
+    header = _ros1_header(**fields)
+    return _u32(len(header)) + header + _u32(len(data)) + data
+
+
+def _ros1_header(**fields: bytes) -> bytes:
+    """The fields of a record's header, or of what a connection record holds, without their length."""
+    return b"".join(_u32(len(name) + 1 + len(value)) + name.encode() + b"=" + value for name, value in fields.items())
+
+
+def _u32(number: int) -> bytes:
+    return struct.pack("<I", number)
 
 
 def split_copy(path: Path, parts: int = 3, sets: int = 10) -> Path:

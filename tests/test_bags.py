@@ -3,7 +3,10 @@
 
 import re
 import shutil
+import sqlite3
+import sys
 import tracemalloc
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +17,13 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType
 from recordings import SAMPLE, SAMPLE_MCAP, Entry
 from rosbags.interfaces import QosDurability, QosReliability
+from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionMode, Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from cvcdepth_core.errors import RecordingError
-from cvcdepth_ros.bags import LATCHED, RecordedMessage, RecordingWriter, open_recording, typestore
+from cvcdepth_ros.bags import LATCHED, RecordedMessage, RecordingWriter, open_recording, sqlite_file, typestore
+from cvcdepth_ros.bags.typestores import parsed_definition
 
 SECOND = 10**9
 
@@ -92,6 +97,12 @@ STORAGES = {
         path / "bag.mcap", entries[::-1], use_chunking=False
     ),
     "ros1": lambda path, entries: recordings.ros1_copy(path / "bag.bag"),
+    "ros1 bz2": lambda path, entries: recordings.ros1_copy(
+        path / "bag.bag", compression=Ros1Writer.CompressionFormat.BZ2
+    ),
+    "ros1 lz4": lambda path, entries: recordings.ros1_copy(
+        path / "bag.bag", compression=Ros1Writer.CompressionFormat.LZ4
+    ),
 }
 
 
@@ -106,6 +117,15 @@ def test_every_storage_gives_the_same_messages_in_time_order(storage: str, sampl
         }
         assert (recording.start, recording.end) == (sample[0].log_time, sample[-1].log_time)
         assert recording.damage is None
+
+
+def test_compressed_files_of_the_same_name_from_two_folders_are_both_read(sample: list[Entry], tmp_path: Path):
+    packed = []
+    for half, entries in {"first": sample[:20], "second": sample[20:]}.items():
+        (tmp_path / half).mkdir()
+        mcap = recordings.write_mcap(tmp_path / f"{half}.mcap", entries)
+        packed.append(recordings.zstd_file(mcap, tmp_path / half / "bag.mcap.zstd"))
+    assert stamps(read(packed)) == stamps(as_messages(sample))
 
 
 @pytest.mark.parametrize("storage", ["folder", "sqlite folder", "split folder", "ros1"])
@@ -219,6 +239,30 @@ def test_the_write_ahead_log_of_a_crashed_recorder_is_read(sample: list[Entry], 
     before = sorted(file.name for file in tmp_path.iterdir()), path.read_bytes()
     assert stamps(read(path)) == stamps(as_messages(sample))
     assert (sorted(file.name for file in tmp_path.iterdir()), path.read_bytes()) == before, "nothing is changed"
+
+
+def test_a_message_beyond_measure_in_a_database_costs_only_itself(
+    sample: list[Entry], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(sqlite_file, "MAX_BLOCK_BYTES", 1_000_000)
+    path = recordings.sqlite_copy(tmp_path / "bag")
+    with closing(sqlite3.connect(path / "bag.db3")) as database:
+        database.execute("UPDATE messages SET data = zeroblob(?) WHERE id = 3", (1_000_001,))
+        database.commit()
+    with open_recording(path) as recording:
+        assert stamps(list(recording.messages())) == stamps(as_messages([*sample[:2], *sample[3:]]))
+        assert f"{sample[2].topic} at {sample[2].log_time} ns skipped: 1000001 bytes" in (recording.damage or "")
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="sqlite3 has no limits")
+def test_a_name_beyond_measure_in_a_database_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sqlite_file, "MAX_BLOCK_BYTES", 100_000)
+    path = recordings.sqlite_copy(tmp_path / "bag")
+    with closing(sqlite3.connect(path / "bag.db3")) as database:
+        database.execute("UPDATE topics SET type = ? WHERE id = 1", ("x" * 200_000,))
+        database.commit()
+    with pytest.raises(RecordingError, match=r"bag.db3: not readable as a rosbag2 database: string or blob too big"):
+        open_recording(path)
 
 
 def test_one_damaged_file_of_a_split_recording_costs_only_itself(tmp_path: Path):
@@ -364,6 +408,22 @@ def test_the_recordings_own_definition_of_a_common_type_wins(tmp_path: Path):
     path = custom_recording(tmp_path / "bag", "sensor_msgs/msg/Temperature", "float64 celsius\n", celsius=21.5)
     with open_recording(path) as recording:
         assert recording.deserialize(next(recording.messages())).celsius == 21.5
+
+
+@pytest.mark.parametrize(
+    ("nothing", "something"),
+    [
+        ("int32[0] a", "int32[1] a"),
+        ("std_msgs/Empty a", "std_msgs/Bool a"),
+        ("y/C a", "y/D a"),
+        ("y/C[3] a", "y/D[3] a"),
+    ],
+)
+def test_a_sequence_whose_elements_have_no_bytes_is_not_used(nothing: str, something: str):
+    line = "=" * 80
+    definition = f"y/B[] a\n{line}\nMSG: y/B\n%s\n{line}\nMSG: y/C\n{line}\nMSG: y/D\nbool a\n"
+    assert parsed_definition(definition % nothing, "x/msg/A") == {}
+    assert parsed_definition(definition % something, "x/msg/A").keys() > {"x/msg/A", "y/msg/B"}
 
 
 def test_a_message_too_short_for_its_type_is_named(sample: list[Entry], tmp_path: Path):

@@ -30,16 +30,24 @@ from mcap.summary import Summary
 from cvcdepth_ros.bags.ordering import Source, in_time_order
 from cvcdepth_ros.bags.recent_blocks import MESSAGE_BYTES, RecentBlocks
 from cvcdepth_ros.bags.remote import Location, RemotePath
-from cvcdepth_ros.bags.topics import RecordedMessage, RecordingFile, Topic, joined_topics, recorded_qos
+from cvcdepth_ros.bags.topics import (
+    MAX_BLOCK_BYTES,
+    RecordedMessage,
+    RecordingFile,
+    Topic,
+    joined_topics,
+    recorded_qos,
+)
 
 MAGIC = b"\x89MCAP0\r\n"
-MAX_BLOCK_BYTES = 256 * 2**20
-"""Of a record, or of an unpacked chunk; recorders write chunks of 1 to 16 MiB, longer only for a longer message."""
 MAX_BLOCK_RECORDS = 2**20
+# Of all topics and types, which are kept as long as the file is read; a thousand of them take some MB.
+_MAX_DESCRIBED_BYTES = 64 * 2**20
 _FOOTER_BYTES = 37  # the footer record and the magic after it
 # A window is asked for again and again: for transforms, for CameraInfo, for the pictures of every training sample.
 _recent = RecentBlocks(80 * 2**20)
 _NEEDED = (Opcode.CHUNK, Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL)
+_DESCRIBING = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA)
 _RECORD_HEADER = struct.Struct("<BQ")  # opcode, length of what follows
 # What mcap and the decompressors raise on damaged bytes (lz4: RuntimeError; wrong CRC and text: ValueError).
 _DAMAGE = (McapError, zstandard.ZstdError, struct.error, ValueError, RuntimeError, KeyError, OverflowError, MemoryError)
@@ -62,6 +70,8 @@ class _Index:
     counts: Counter[int] = field(default_factory=Counter)
     """Messages per channel id."""
     blocks: list[_Block] = field(default_factory=list)
+    described: int = 0
+    """Bytes of schemas and channels."""
 
 
 class McapFile(RecordingFile):
@@ -150,8 +160,10 @@ class McapFile(RecordingFile):
         if not 0 < length <= MAX_BLOCK_BYTES:
             raise McapError(f"of {length} bytes")
         stream.seek(footer.summary_start)
+        section = stream.read(length)
+        _check_records(memoryview(section)[: -len(MAGIC)])
         summary = Summary()
-        for record in _records(stream.read(length)):
+        for record in _records(section):
             _add_to_summary(summary, record)
         return summary
 
@@ -161,7 +173,10 @@ class McapFile(RecordingFile):
         offset = len(MAGIC)
         while (header := self._record_header(stream, offset)) and header[0] != Opcode.DATA_END:
             records = self._intact_records(stream, offset)
-            _add_records(index, offset, records)
+            try:
+                _add_records(index, offset, records)
+            except McapError as error:
+                self._report(f"chunk at byte {offset} skipped", error)
             offset += _RECORD_HEADER.size + header[1]
         if header is None:
             self._report(
@@ -196,6 +211,7 @@ class McapFile(RecordingFile):
         if opcode not in _NEEDED:
             return []
         _check_size(length)
+        _check_described(length if opcode in _DESCRIBING else 0)
         body = ReadDataStream(io.BytesIO(stream.read(length)))
         if opcode == Opcode.CHUNK:
             return _chunk_records(Chunk.read(body))
@@ -261,17 +277,30 @@ def _add_records(index: _Index, offset: int, records: list[McapRecord]) -> None:
     """Add to the index what one record of the file, at `offset`, holds."""
     messages = []
     for record in records:
-        if isinstance(record, Schema):
-            index.schemas[record.id] = record
-        elif isinstance(record, Channel):
-            index.channels[record.id] = record
-            index.counts[record.id] += 0
+        if isinstance(record, Schema | Channel):
+            _describe(index, record)
         elif isinstance(record, Message):
             messages.append((record.log_time, record.channel_id))
     if messages:
         channels = Counter(channel for _, channel in messages)
         index.counts.update(channels)
         index.blocks.append(_Block(min(messages)[0], max(messages)[0], offset, frozenset(channels)))
+
+
+def _describe(index: _Index, record: Schema | Channel) -> None:
+    """Add a schema or channel to the index; chunks repeat them, which takes no more memory."""
+    if isinstance(record, Schema):
+        known, size = index.schemas.get(record.id) == record, len(record.name) + len(record.data)
+    else:
+        texts = [record.topic, *record.metadata, *record.metadata.values()]
+        known, size = index.channels.get(record.id) == record, sum(map(len, texts))
+    index.described += 0 if known else size
+    _check_described(index.described)
+    if isinstance(record, Schema):
+        index.schemas[record.id] = record
+    else:
+        index.channels[record.id] = record
+        index.counts[record.id] += 0
 
 
 def _records(section: bytes) -> Iterator[McapRecord]:
@@ -294,7 +323,7 @@ def _chunk_records(chunk: Chunk) -> list[McapRecord]:
     content = _unpacked(chunk)
     if len(content) != chunk.uncompressed_size:
         raise McapError(f"holds {len(content)} bytes, announces {chunk.uncompressed_size}")
-    _check_number(content)
+    _check_records(content)
     return breakup_chunk(replace(chunk, compression="", data=content), validate_crc=True)
 
 
@@ -316,15 +345,22 @@ def _unpacked(chunk: Chunk) -> bytes:
     return chunk.data
 
 
-def _check_number(content: bytes) -> None:
-    """Refuse to make millions of objects out of one chunk."""
-    position = 0
+def _check_records(content: bytes | memoryview) -> None:
+    """Refuse to make millions of objects out of one chunk or index."""
+    position = described = 0
     for _ in range(MAX_BLOCK_RECORDS):
         if position >= len(content):
             return
-        _, length = _RECORD_HEADER.unpack_from(content, position)
+        opcode, length = _RECORD_HEADER.unpack_from(content, position)
         position += _RECORD_HEADER.size + length
+        described += length if opcode in _DESCRIBING else 0
+        _check_described(described)
     raise McapError(f"more than {MAX_BLOCK_RECORDS} records")
+
+
+def _check_described(size: int) -> None:
+    if size > _MAX_DESCRIBED_BYTES:
+        raise McapError(f"topics and types of more than {_MAX_DESCRIBED_BYTES} bytes")
 
 
 def _check_size(length: int) -> None:

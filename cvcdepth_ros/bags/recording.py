@@ -4,7 +4,7 @@
 from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import cached_property, partial
 from pathlib import Path, PurePath
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, mkdtemp
 from typing import IO, Any
 
 import yaml
@@ -13,16 +13,25 @@ from rosbags.serde import SerdeError
 from rosbags.typesys.store import Typestore
 
 from cvcdepth_core.errors import RecordingError
+from cvcdepth_core.yaml_text import load_yaml
 from cvcdepth_ros.bags import mcap_file, ros1_file, sqlite_file
-from cvcdepth_ros.bags.mcap_file import MAX_BLOCK_BYTES, McapFile, unpack_zstd
+from cvcdepth_ros.bags.mcap_file import McapFile, unpack_zstd
 from cvcdepth_ros.bags.ordering import Source, in_time_order
 from cvcdepth_ros.bags.remote import Location, RemotePath, location
 from cvcdepth_ros.bags.ros1_file import Ros1File
 from cvcdepth_ros.bags.sqlite_file import SqliteFile
-from cvcdepth_ros.bags.topics import STORAGE_SUFFIXES, RecordedMessage, RecordingFile, Topic, joined_topics
+from cvcdepth_ros.bags.topics import (
+    MAX_BLOCK_BYTES,
+    STORAGE_SUFFIXES,
+    RecordedMessage,
+    RecordingFile,
+    Topic,
+    joined_topics,
+)
 from cvcdepth_ros.bags.typestores import typestore_for
 
 _LOCAL_READERS: dict[bytes, Callable[[Path], RecordingFile]] = {
+    mcap_file.MAGIC: McapFile,
     sqlite_file.MAGIC: SqliteFile,
     ros1_file.MAGIC: Ros1File,
 }
@@ -193,9 +202,9 @@ class Recording:
             self._damage.append(f"{folder}: no metadata.yaml, reading all files of the folder")
             return []
         try:
-            names = yaml.safe_load(metadata.read_text())["rosbag2_bagfile_information"]["relative_file_paths"]
+            names = load_yaml(metadata.read_text())["rosbag2_bagfile_information"]["relative_file_paths"]
             return [folder / PurePath(name).name for name in names]
-        except (yaml.YAMLError, ValueError, KeyError, TypeError, RecursionError) as error:
+        except (yaml.YAMLError, ValueError, LookupError, TypeError) as error:
             self._damage.append(f"{metadata}: unreadable ({type(error).__name__}), reading all files of the folder")
             return []
 
@@ -215,25 +224,21 @@ class Recording:
 
     def _open_file(self, path: Location) -> RecordingFile:
         try:
-            with path.open("rb") as stream:
-                beginning = stream.read(16)
-            if beginning.startswith(mcap_file.MAGIC):
-                return McapFile(path)
+            beginning = _beginning(path)
             if isinstance(path, RemotePath):
-                raise RecordingError(f"{path}: {_begins(beginning)}; behind a URL only MCAP can be read, by seeking")
-            if beginning.startswith(_ZSTD_MAGIC):
-                return self._open_file(self._unpack(path))
-            for magic, reader in _LOCAL_READERS.items():
-                if beginning.startswith(magic):
-                    return reader(path)
+                return _remote_reader(path, beginning)
+            if not beginning.startswith(_ZSTD_MAGIC):
+                return _local_reader(path, beginning, str(path))
+            # Once: each layer of a file packed again and again may multiply its size by as much.
+            unpacked = self._unpack(path)
+            return _local_reader(unpacked, _beginning(unpacked), f"{path} (unpacked)")
         except OSError as error:
             raise RecordingError(f"{path}: {error.strerror or error}") from error
-        raise RecordingError(f"{path}: {_begins(beginning)}; an MCAP, SQLite or ROS 1 recording was expected")
 
     def _unpack(self, path: Path) -> Path:
-        """Unpack a file that was compressed as a whole into a temporary folder."""
+        """Unpack a file that was compressed as a whole into a folder of its own: others may have the same name."""
         self._unpacked = self._unpacked or TemporaryDirectory(prefix="cvcdepth_")
-        target = Path(self._unpacked.name) / path.stem
+        target = Path(mkdtemp(dir=self._unpacked.name)) / path.stem
         try:
             with zstandard.open(path, "rb") as packed, target.open("wb") as unpacked:
                 _copy(packed, unpacked, _MAX_EXPANSION * path.stat().st_size)
@@ -249,11 +254,29 @@ def _unlisted(present: Sequence[Location], listed: Sequence[Location]) -> list[s
     return [name for name in names if name.removesuffix(_ZSTD_SUFFIX) not in known]
 
 
+def _remote_reader(path: RemotePath, beginning: bytes) -> RecordingFile:
+    if not beginning.startswith(mcap_file.MAGIC):
+        raise RecordingError(f"{path}: {_begins(beginning)}; behind a URL only MCAP can be read, by seeking")
+    return McapFile(path)
+
+
+def _local_reader(path: Path, beginning: bytes, where: str) -> RecordingFile:
+    for magic, reader in _LOCAL_READERS.items():
+        if beginning.startswith(magic):
+            return reader(path)
+    raise RecordingError(f"{where}: {_begins(beginning)}; an MCAP, SQLite or ROS 1 recording was expected")
+
+
 def _copy(packed: IO[bytes], unpacked: IO[bytes], most: int) -> None:
     while piece := packed.read(_PIECE_BYTES):
         if unpacked.tell() + len(piece) > most:
             raise zstandard.ZstdError(f"unpacks to more than {most} bytes, {_MAX_EXPANSION} times its size")
         unpacked.write(piece)
+
+
+def _beginning(path: Location) -> bytes:
+    with path.open("rb") as stream:
+        return stream.read(16)
 
 
 def _begins(beginning: bytes) -> str:

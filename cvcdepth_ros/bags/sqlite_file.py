@@ -2,17 +2,28 @@
 """Reading of one .db3 file (rosbag2's sqlite3 storage), also with the write-ahead log that a crash leaves beside it."""
 
 import sqlite3
+import sys
 from collections.abc import Collection, Iterator
 from contextlib import closing
 from pathlib import Path
 from urllib.parse import quote
 
 from cvcdepth_core.errors import RecordingError
-from cvcdepth_ros.bags.topics import RecordedMessage, RecordingFile, Topic, error_text, joined_topics, recorded_qos
+from cvcdepth_ros.bags.topics import (
+    MAX_BLOCK_BYTES,
+    RecordedMessage,
+    RecordingFile,
+    Topic,
+    error_text,
+    joined_topics,
+    recorded_qos,
+)
 
 MAGIC = b"SQLite format 3\0"
 # What sqlite3 raises on damaged bytes, also for an error whose text is not UTF-8 and for a length beyond all memory.
 _DAMAGE = (sqlite3.Error, UnicodeDecodeError, OverflowError, MemoryError)
+# The message, or its length where that is beyond measure, which SQLite knows without reading it.
+_DATA = "CASE WHEN typeof(data) != 'blob' THEN NULL WHEN length(data) > ? THEN length(data) ELSE data END"
 _TABLES = ("topics", "messages", "message_definitions")
 
 
@@ -41,16 +52,19 @@ class SqliteFile(RecordingFile):
         """Give the messages of `topics` with start <= log_time < stop, in time order."""
         wanted = {id_: name for id_, name in self._names.items() if name in topics}
         query = (
-            "SELECT topic_id, timestamp, data FROM messages WHERE timestamp >= ? AND timestamp < ? "
+            f"SELECT topic_id, timestamp, {_DATA} FROM messages WHERE timestamp >= ? AND timestamp < ? "
             f"AND topic_id IN ({', '.join('?' * len(wanted))}) ORDER BY timestamp, id"
         )
         count = 0
         with closing(self._connect()) as database:
             try:
-                for id_, log_time, cdr in database.execute(query, (start, stop, *wanted)):
+                for id_, log_time, cdr in database.execute(query, (MAX_BLOCK_BYTES, start, stop, *wanted)):
                     if isinstance(log_time, int) and isinstance(cdr, bytes):
                         yield RecordedMessage(wanted[id_], log_time, cdr)
                         count += 1
+                    elif isinstance(cdr, int):
+                        size = f"{cdr} bytes; at most {MAX_BLOCK_BYTES} are read at once"
+                        self._report(f"{wanted[id_]} at {log_time} ns skipped: {size}")
                     else:
                         self._report(f"{wanted[id_]}: a row with no integer as time or no bytes as message was skipped")
             except _DAMAGE as error:
@@ -69,6 +83,8 @@ class SqliteFile(RecordingFile):
         if leftover:
             database.execute("PRAGMA locking_mode=EXCLUSIVE")
         database.execute("PRAGMA trusted_schema=OFF")
+        if sys.version_info >= (3, 11):  # for names and definitions; Python 3.10 leaves SQLite's own limit, 1 GB
+            database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_BLOCK_BYTES)
         return database
 
     def _readable_names(self, database: sqlite3.Connection) -> dict[int, str]:

@@ -15,6 +15,10 @@ from cvcdepth_ros.bags.remote import Location
 
 STORAGE_SUFFIXES = (".mcap", ".db3", ".bag", ".mcap.zstd", ".db3.zstd")
 """How the names of storage files end; a file that is named itself may end otherwise."""
+MAX_BLOCK_BYTES = 256 * 2**20
+"""Of a record, or of an unpacked chunk; recorders write chunks of 1 to 16 MiB, longer only for a longer message."""
+# A profile takes some 300 characters, and there is one for each publisher of the topic.
+_MAX_QOS = 2**18
 
 
 class RecordedMessage(NamedTuple):
@@ -103,9 +107,12 @@ def joined_topics(topics: Collection[Topic], where: Location) -> dict[str, Topic
 
 def recorded_qos(text: str | None) -> tuple[Qos, ...] | None:
     """Return the profiles of an `offered_qos_profiles` entry (YAML), None when it is absent, empty or unreadable."""
+    # Recorders write no anchors. With them, a few lines of YAML can merge into billions of entries.
+    if not text or "&" in text or len(text) > _MAX_QOS:
+        return None
     try:
-        return tuple(parse_qos(text or "")) or None
-    except (ReaderError, KeyError, TypeError, AttributeError):
+        return tuple(parse_qos(text)) or None
+    except (ReaderError, LookupError, TypeError, AttributeError, ValueError, RecursionError):
         return None
 
 

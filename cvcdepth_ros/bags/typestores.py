@@ -15,6 +15,7 @@ from cvcdepth_ros.bags.topics import Topic
 _SEPARATOR = "=" * 80 + "\n"
 _TYPE_NAME = re.compile(r"[A-Za-z]\w*(/[A-Za-z]\w*)+", re.ASCII)
 _FIELD_NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)
+_NOTHING = "structure_needs_at_least_one_member"  # what ROS 2 puts into types without fields, and ROS 1 does not
 # The longest definitions of real messages have some hundred fields and 50 kB, most of it comments.
 _MAX_DEFINITION = 2**18
 _MAX_FIELDS = 2000
@@ -75,7 +76,8 @@ def _are_usable(types: Typesdict) -> bool:
     fields = [field for _, fields in types.values() for field in fields]
     names = all(map(_TYPE_NAME.fullmatch, types)) and all(_FIELD_NAME.fullmatch(name) for name, _ in fields)
     unrolled = sum(_unrolled(kind) for _, kind in fields)
-    return names and len(fields) <= _MAX_FIELDS and unrolled <= _MAX_FIELDS and _are_complete(types)
+    of_measure = len(fields) <= _MAX_FIELDS and unrolled <= _MAX_FIELDS
+    return names and of_measure and _are_complete(types) and not _repeats_nothing(types)
 
 
 def _unrolled(kind: FieldDesc) -> int:
@@ -85,6 +87,23 @@ def _unrolled(kind: FieldDesc) -> int:
     element, count = kind[1]
     is_number = element[0] == Nodetype.BASE and element[1][0] not in ("string", "wstring")
     return 0 if is_number else count
+
+
+def _repeats_nothing(types: Typesdict) -> bool:
+    """Say whether a sequence has elements without bytes: four bytes would say that there are billions of them."""
+    known = {name for name, (_, fields) in typestore().fielddefs.items() if all(name == _NOTHING for name, _ in fields)}
+    empty = known - types.keys()
+    while more := {name for name in types.keys() - empty if all(_is_nothing(field, empty) for field in types[name][1])}:
+        empty |= more
+    fields = [kind for _, kinds in types.values() for _, kind in kinds]
+    return any(kind[0] == Nodetype.SEQUENCE and _part(kind) in empty for kind in fields)
+
+
+def _is_nothing(field: tuple[str, FieldDesc], empty: set[str]) -> bool:
+    """Say whether a field takes no byte in a ROS 1 message, `empty` being types that take none."""
+    name, kind = field
+    without_elements = kind[0] == Nodetype.ARRAY and kind[1][1] == 0
+    return name == _NOTHING or without_elements or (kind[0] != Nodetype.SEQUENCE and _part(kind) in empty)
 
 
 def _are_complete(types: Typesdict) -> bool:

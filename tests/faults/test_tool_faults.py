@@ -5,6 +5,7 @@ Nothing may execute, hang or take memory without measure; the answer is one line
 The table in docs/reliability.md is made of these names (`--fault-table FILE`).
 """
 
+import bz2
 import json
 import os
 import pickle
@@ -23,10 +24,9 @@ import mcap.writer
 import numpy as np
 import pytest
 import recordings
-import yaml
 import zstandard
 from mcap.data_stream import RecordBuilder
-from mcap.records import Chunk
+from mcap.records import Chunk, Schema
 from mcap.writer import CompressionType
 from recordings import SAMPLE_MCAP, Entry
 
@@ -86,20 +86,51 @@ def _chunk_file(path: Path, chunks: list[Chunk]) -> Path:
     return path
 
 
-def _bomb(compression: str, announced: int | None = None) -> Callable[[Path, list[Entry]], Path]:
-    """A chunk of a few kilobytes that unpacks to 2 GiB."""
+def _packed_zeros(compression: str) -> bytes:
+    """A few kilobytes that unpack to 2 GiB."""
+    piece, count = bytes(16 * MIB), 128
+    if compression == "zstd":
+        packer = zstandard.ZstdCompressor().compressobj()
+        return b"".join(packer.compress(piece) for _ in range(count)) + packer.flush()
+    if compression == "bz2":  # streams one behind the other are one
+        return bz2.compress(piece) * count
+    with lz4.frame.LZ4FrameCompressor() as packer:
+        return packer.begin() + b"".join(packer.compress(piece) for _ in range(count)) + packer.flush()
+
+
+def _bomb(compression: str, announced: int = 2048 * MIB) -> Callable[[Path, list[Entry]], Path]:
+    def make(folder: Path, sample: list[Entry]) -> Path:
+        chunk = Chunk(compression, _packed_zeros(compression), 10, 0, 0, announced)
+        return _chunk_file(folder / "bomb.mcap", [chunk])
+
+    return make
+
+
+def _ros1_bomb(compression: str, announced: int = 2048 * MIB) -> Callable[[Path, list[Entry]], Path]:
+    def make(folder: Path, sample: list[Entry]) -> Path:
+        return recordings.ros1_chunk(folder / "bomb.bag", compression, announced, _packed_zeros(compression))
+
+    return make
+
+
+def _large_ros1_header(folder: Path, sample: list[Entry]) -> Path:
+    with (folder / "a.bag").open("wb") as stream:
+        stream.write(b"#ROSBAG V2.0\n" + struct.pack("<I", 1100 * MIB))
+        stream.truncate(1200 * MIB)  # of nothing, which takes no place on disk
+    return folder / "a.bag"
+
+
+def _repeated_ros1_index(folder: Path, sample: list[Entry]) -> Path:
+    """Nine million messages in 400 kB: the index lists one chunk and its thirty thousand messages again and again."""
+    return recordings.ros1_chunk(folder / "a.bag", "none", 1, b"a", messages=30_000, times=300)
+
+
+def _ros1_nothings(definition: str) -> Callable[[Path, list[Entry]], Path]:
+    """A ROS 1 message of four bytes: the number of its elements."""
 
     def make(folder: Path, sample: list[Entry]) -> Path:
-        size = 2048 * MIB
-        if compression == "zstd":
-            packer = zstandard.ZstdCompressor().compressobj()
-            packed = b"".join(packer.compress(bytes(16 * MIB)) for _ in range(128)) + packer.flush()
-        else:
-            with lz4.frame.LZ4FrameCompressor() as packer:
-                packed = packer.begin() + b"".join(packer.compress(bytes(16 * MIB)) for _ in range(128))
-                packed += packer.flush()
-        chunk = Chunk(compression, packed, 10, 0, 0, size if announced is None else announced)
-        return _chunk_file(folder / "bomb.mcap", [chunk])
+        content = recordings.ros1_message(struct.pack("<I", 300_000_000))
+        return recordings.ros1_chunk(folder / "a.bag", "none", len(content), content, definition=definition)
 
     return make
 
@@ -108,6 +139,33 @@ def _million_records(folder: Path, sample: list[Entry]) -> Path:
     records = struct.pack("<BQHIQQ", 5, 22, 1, 0, 0, 0) * 3_000_000
     chunk = Chunk("zstd", zstandard.compress(records), 10, 0, 0, len(records))
     return _chunk_file(folder / "records.mcap", [chunk])
+
+
+def _definitions(number: int, size: int) -> Callable[[Path, list[Entry]], Path]:
+    """Chunks with one definition each; all are kept until the last message is read."""
+
+    def make(folder: Path, sample: list[Entry]) -> Path:
+        return _chunk_file(folder / "definitions.mcap", [_definition(id_, size) for id_ in range(1, number + 1)])
+
+    return make
+
+
+def _definition(id_: int, size: int) -> Chunk:
+    builder = RecordBuilder()
+    Schema(id=id_, name="x/msg/A", encoding="ros2msg", data=bytes(size)).write(builder)
+    content = builder.end()
+    return Chunk("zstd", zstandard.compress(content), 10, 0, 0, len(content))
+
+
+def _large_summary(folder: Path, sample: list[Entry]) -> Path:
+    """The index describes something with 65 MiB of text."""
+    with (folder / "a.mcap").open("wb") as stream:
+        writer = mcap.writer.Writer(stream)
+        writer.start(profile="ros2")
+        schema = writer.register_schema("x/msg/A", "ros2msg", b"")
+        writer.add_message(writer.register_channel("/a", "cdr", schema, {"a": "a" * 65 * MIB}), 5, bytes(64), 5)
+        writer.finish()
+    return folder / "a.mcap"
 
 
 def _overlapping(folder: Path, sample: list[Entry]) -> Path:
@@ -145,15 +203,23 @@ def _summary_of_chunks(folder: Path, sample: list[Entry]) -> Path:
     return path
 
 
+def _offered_as(profiles: str) -> Callable[[Path, list[Entry]], Path]:
+    """One topic's publishers offer this as QoS."""
+    return _with_topic(b"", {"offered_qos_profiles": profiles})
+
+
 def _defined_as(definition: str) -> Callable[[Path, list[Entry]], Path]:
     """The type of one topic is unknown and defined so by the recording."""
+    return _with_topic(definition.encode(), {})
 
+
+def _with_topic(definition: bytes, metadata: dict[str, str]) -> Callable[[Path, list[Entry]], Path]:
     def make(folder: Path, sample: list[Entry]) -> Path:
         with (folder / "a.mcap").open("wb") as stream:
             writer = mcap.writer.Writer(stream)
             writer.start(profile="ros2")
-            schema = writer.register_schema("x/msg/A", "ros2msg", definition.encode())
-            writer.add_message(writer.register_channel("/a", "cdr", schema), 5, bytes(64), 5)
+            schema = writer.register_schema("x/msg/A", "ros2msg", definition)
+            writer.add_message(writer.register_channel("/a", "cdr", schema, metadata), 5, bytes(64), 5)
             writer.finish()
         return folder / "a.mcap"
 
@@ -168,6 +234,20 @@ def _packed_message(folder: Path, sample: list[Entry]) -> Path:
 def _packed_file(folder: Path, sample: list[Entry]) -> Path:
     (folder / "bag.mcap.zstd").write_bytes(zstandard.compress(bytes(1024 * MIB)))
     return folder / "bag.mcap.zstd"
+
+
+def _with_metadata(text: str) -> Callable[[Path, list[Entry]], Path]:
+    def make(folder: Path, sample: list[Entry]) -> Path:
+        bag = recordings.write_rosbag2(folder / "bag", sample)
+        (bag / "metadata.yaml").write_text(text)
+        return bag
+
+    return make
+
+
+def _file_packed_twice(folder: Path, sample: list[Entry]) -> Path:
+    once = recordings.zstd_file(_mcap(folder, sample), folder / "once.mcap.zstd")
+    return recordings.zstd_file(once, folder / "twice.mcap.zstd")
 
 
 def _sqlite(*statements: str) -> Callable[[Path, list[Entry]], Path]:
@@ -268,6 +348,12 @@ _LAUGHS = "a0: &a0 [ha, ha, ha, ha, ha, ha, ha, ha, ha]\n" + "".join(
 )
 
 
+def _merges(levels: int) -> str:
+    """Mappings, each merged from nine times the one before it."""
+    merged = (f"a{n}: &a{n} {{<<: [{', '.join([f'*a{n - 1}'] * 9)}]}}\n" for n in range(1, levels))
+    return "a0: &a0 {ha: ha}\n" + "".join(merged)
+
+
 class _Executes:
     def __reduce__(self) -> tuple[Any, ...]:
         return os.system, (f"touch {_Executes.marker}",)
@@ -299,14 +385,35 @@ FAULTS = {
     "chunk that unpacks to 2 GiB (lz4)": Fault(_inspected(_bomb("lz4")), 1, "at most 268435456 are read at once"),
     "the same in lz4, announced as 1 kB": Fault(_inspected(_bomb("lz4", 1000)), 1, "chunk at byte 8 skipped"),
     "chunk that announces 2^62 bytes": Fault(_inspected(_bomb("lz4", 2**62)), 1, "at most 268435456 are read"),
+    "ROS 1 chunk that unpacks to 2 GiB (bz2)": Fault(_inspected(_ros1_bomb("bz2")), 0, "at most 268435456 are read"),
+    "the same in bz2, announced as 1 kB": Fault(_inspected(_ros1_bomb("bz2", 1000)), 0, "does not hold the 1000 bytes"),
+    "ROS 1 chunk that unpacks to 2 GiB (lz4)": Fault(_inspected(_ros1_bomb("lz4")), 0, "at most 268435456 are read"),
+    "ROS 1 chunk in lz4, announced as 1 kB": Fault(
+        _inspected(_ros1_bomb("lz4", 1000)), 0, "does not hold the 1000 bytes"
+    ),
+    "ROS 1 header of 1 GiB": Fault(_inspected(_large_ros1_header), 1, "record of 1153433600 bytes at byte 17"),
+    "ROS 1 index that repeats itself": Fault(_inspected(_repeated_ros1_index), 1, "they overlap"),
+    "ROS 1 message of 300 million nothings": Fault(
+        _inspected(_ros1_nothings(f"y/B[] a\n{'=' * 80}\nMSG: y/B\n")), 1, "elements without bytes"
+    ),
     "three million records in a chunk": Fault(_inspected(_million_records), 1, "more than 1048576 records"),
+    "25 definitions of 60 MiB": Fault(_inspected(_definitions(25, 60 * MIB)), 1, "topics and types of more than 67"),
+    "definition of 65 MiB": Fault(_inspected(_definitions(1, 65 * MIB)), 1, "topics and types of more than 67108864"),
+    "channel of 65 MiB": Fault(_inspected(_large_summary), 1, "index unreadable (topics and types of more than 67"),
     "a hundred chunks at the same time": Fault(_inspected(_overlapping), 0, "bytes at the same time"),
     "index that leads to the messages": Fault(_inspected(_summary_of_chunks), 0, '"intact"'),
     "type defined by itself": Fault(_inspected(_defined_as("A a\n")), 0, '"/a"'),
     "type with 2 million strings": Fault(_inspected(_defined_as("string[2000000] a\n")), 0, '"/a"'),
     "type of an unknown type": Fault(_inspected(_defined_as("y/B b\n")), 0, '"/a"'),
+    "QoS with a date that is none": Fault(_inspected(_offered_as("- 2001-99-99")), 0, '"/a"'),
+    "QoS nested 100 000 deep": Fault(_inspected(_offered_as("[" * 100_000)), 0, '"/a"'),
+    "QoS with 43 million merged entries": Fault(_inspected(_offered_as(_merges(9))), 0, '"/a"'),
     "message that unpacks to 1 GiB": Fault(_inspected(_packed_message), 0, "unpacks to more than 268435456 bytes"),
     "file that unpacks to 1 GiB of zeros": Fault(_inspected(_packed_file), 1, "500 times its size"),
+    "file that was packed twice": Fault(_inspected(_file_packed_twice), 1, "twice.mcap.zstd (unpacked): begins with"),
+    "metadata.yaml with 43 million merged entries": Fault(
+        _inspected(_with_metadata(_merges(9))), 0, "metadata.yaml: unreadable (YAMLError)"
+    ),
     "view that goes on for ever": Fault(
         _inspected(_sqlite("DROP TABLE messages", _ENDLESS)), 1, "messages is no plain table"
     ),
@@ -317,6 +424,11 @@ FAULTS = {
     ),
     "timestamps that are text": Fault(_inspected(_sqlite("UPDATE messages SET timestamp = 'soon'")), 1, "not integers"),
     "messages that are numbers": Fault(_inspected(_sqlite("UPDATE messages SET data = 7")), 0, "was skipped"),
+    "message of 257 MiB": Fault(
+        _inspected(_sqlite(f"UPDATE messages SET data = zeroblob({257 * MIB}) WHERE id = 1")),
+        0,
+        "269484032 bytes; at most 268435456 are read at once",
+    ),
     "transforms in a loop": Fault(_transforms(_loop), 1, "closes a loop"),
     "quaternion of length 7": Fault(_transforms(_not_a_unit), 1, "has norm 7"),
     "translation that is no number": Fault(_transforms(_not_a_number), 1, "want 3 + 4 finite numbers"),
@@ -328,6 +440,8 @@ FAULTS = {
     "YAML that is no rig": Fault(_rig("- a\n- b\n"), 1, "rig.yaml"),
     "YAML that is no YAML": Fault(_rig("a: [\n"), 1, "cannot be read"),
     "YAML with a billion words": Fault(_rig(f"{_LAUGHS}cameras: *a9\n"), 1, "rig.yaml"),
+    "YAML with 43 million merged entries": Fault(_rig(_merges(9)), 1, "more than 10000 entries are merged (<<)"),
+    "YAML with a time that is none": Fault(_rig("!!timestamp soon"), 1, "cannot be read"),
     "YAML nested 100 000 deep": Fault(_rig("[" * 100_000), 1, "rig.yaml"),
     "YAML that calls a function": Fault(_rig("!!python/object/apply:os.system [touch executed]"), 1, "cannot be read"),
     "checkpoint that executes (pickle)": Fault(_checkpoint("model.pth", None), 1, "model.pth"),
@@ -367,11 +481,6 @@ def test_the_tool_meets_the_fault_with_one_line_or_a_result_that_tells_it(
         else f"exit 0, tells `{fault.says}`"
     )
     fault_table.add(name, f"`cvcdepth {arguments[0]}`", answer, time.monotonic() - clock)
-
-
-def test_a_rig_files_tags_name_no_functions():
-    with pytest.raises(yaml.YAMLError):
-        yaml.safe_load("!!python/object/apply:os.system [true]")
 
 
 def _peak_mib() -> float:
