@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import recordings
+from camera_faults import Fault
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.serialization import deserialize_message
 from recordings import CAMERAS
@@ -95,6 +96,15 @@ class Scene:
     def fail(self, **faults: Callable[[Any], Any]) -> None:
         self.cameras.faults = faults
 
+    def inject(self, **faults: Fault) -> None:
+        """Let these cameras have these faults, and all others none."""
+        self.cameras.faults = {camera: fault.image for camera, fault in faults.items() if fault.image is not None}
+        self.cameras.infos = dict(self.cameras.good_infos)
+        for camera, fault in faults.items():
+            if fault.info is not None:
+                self.cameras.infos[camera] = copy.deepcopy(self.cameras.good_infos[camera])
+                fault.info(self.cameras.infos[camera])
+
     def await_cameras(self, names: list[str]) -> None:
         self.cameras.run_until(lambda: self.contained() == names, f"clouds of {names}")
 
@@ -107,8 +117,7 @@ class Scene:
         return self.graph.statuses[f"surround_depth: camera {camera}"]
 
     def recover(self) -> None:
-        self.fail()
-        self.cameras.infos = dict(self.cameras.good_infos)
+        self.inject()
         self.await_cameras(list(CAMERAS))
         self.await_state("left", "ok")
 

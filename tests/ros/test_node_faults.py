@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Faults injected over DDS into one running node: what is said, what is published meanwhile, and that it recovers."""
 
-import copy
 import time
 from collections.abc import Iterator
 
@@ -39,12 +38,7 @@ def test_a_fault_of_one_camera_is_named_and_the_others_go_on_until_it_recovers(
 ):
     fault = FAULTS[fault_name]
     begin = time.monotonic()
-    if fault.image is not None:
-        scene.fail(left=fault.image)
-    if fault.info is not None:
-        bad = copy.deepcopy(scene.cameras.good_infos["left"])
-        fault.info(bad)
-        scene.cameras.infos["left"] = bad
+    scene.inject(left=fault)
     status = scene.await_state("left", fault.says)
     told = time.monotonic() - begin
     scene.await_cameras(OTHERS)
