@@ -7,7 +7,7 @@ from typing import Any
 from cvcdepth_core.calibration import Calibration
 from cvcdepth_core.errors import RigError, TransformError
 from cvcdepth_core.poses import Pose
-from cvcdepth_core.rig import CameraEntry, PoseEntry, Rig, RigLayout, order_around_vehicle
+from cvcdepth_core.rig import Camera, CameraEntry, PoseEntry, Rig, RigLayout, order_around_vehicle
 from cvcdepth_ros.messages import calibration_from_message
 from cvcdepth_ros.transforms import TransformTree
 
@@ -105,13 +105,11 @@ class RigAssembler:
 
     def order_around_vehicle(self) -> None:
         """Put the layout's cameras in their order around the vehicle; errors as for `rig`."""
-        poses = {camera.name: camera.base_T_camera for camera in self.rig().cameras}
-        cameras = tuple(map(self._entry, order_around_vehicle(poses)))
+        cameras = tuple(self._entry(camera.name) for camera in self._around_vehicle())
         self.layout = self.layout.model_copy(update={"cameras": cameras})
 
     def completed_layout(self) -> RigLayout:
         """Return the layout with everything that was collected filled in, its cameras ordered around the vehicle."""
-        self.order_around_vehicle()
         cameras = tuple(
             self._entry(camera.name).model_copy(
                 update={
@@ -120,9 +118,14 @@ class RigAssembler:
                     "base_T_camera": PoseEntry.from_matrix(camera.base_T_camera),
                 }
             )
-            for camera in self.rig().cameras
+            for camera in self._around_vehicle()
         )
         return self.layout.model_copy(update={"cameras": cameras})
+
+    def _around_vehicle(self) -> list[Camera]:
+        cameras = {camera.name: camera for camera in self.rig().cameras}
+        order = order_around_vehicle({name: camera.base_T_camera for name, camera in cameras.items()})
+        return [cameras[name] for name in order]
 
     def _layout_of(self, names: Collection[str]) -> RigLayout:
         """Leave the other cameras out; the first camera stands in for the anchor."""

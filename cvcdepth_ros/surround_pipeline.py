@@ -177,9 +177,9 @@ class SurroundPipeline:
             surround = SurroundDepthEstimator(rig, estimator, self._last_built)
         except Exception:
             problems = _camera_problems(rig, estimator.spec)
-            usable = [name for name in rig.names if name not in problems]
             if not problems:
                 raise
+            usable = [name for name in rig.names if name not in problems]
             if len(usable) < self._synchroniser.required:
                 return _Build(None, problems)
             surround = SurroundDepthEstimator(rig.only(usable), estimator, self._last_built)
