@@ -14,8 +14,8 @@ def write_atomically(path: Path, content: bytes) -> None:
 
     Through a link, what it leads to is written; a pipe or a device, which cannot be replaced, is written as it is.
     """
-    path = path.resolve()
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    target = Path(os.path.realpath(path))
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
     try:
         if path.exists() and not path.is_file():
             path.write_bytes(content)
@@ -24,8 +24,8 @@ def write_atomically(path: Path, content: bytes) -> None:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        temporary.replace(path)
-        _flush_directory(path.parent)
+        temporary.replace(target)
+        _flush_directory(target.parent)
     except OSError as error:
         temporary.unlink(missing_ok=True)
         raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error

@@ -53,10 +53,10 @@ class RunFolder:
             raise CheckpointError(f"{self.state}: is empty (0 bytes); remove it to start the run anew")
         return content or b""
 
-    def state_from(self, content: bytes, device: torch.device) -> dict[str, Any]:
-        """Return what `write_state` was given, from what `read_state` gave; CheckpointError when it is damaged."""
+    def state_from(self, content: bytes) -> dict[str, Any]:
+        """Return what `write_state` was given, on the CPU, from what `read_state` gave; CheckpointError for damage."""
         try:
-            return dict(torch.load(io.BytesIO(content), map_location=device, weights_only=True))
+            return dict(torch.load(io.BytesIO(content), map_location="cpu", weights_only=True))
         except (RuntimeError, pickle.UnpicklingError, EOFError, KeyError, TypeError, ValueError) as error:
             reason = str(error).partition("\n")[0]
             raise CheckpointError(f"{self.state}: is damaged ({reason}); remove it to start the run anew") from error

@@ -218,7 +218,7 @@ class Trainer:
     def _resume(self) -> None:
         content = self._processes.told_by_first(self._folder.read_state() if self._processes.is_first else b"")
         if content:
-            state = self._folder.state_from(content, self._device)
+            state = self._folder.state_from(content)
             self._identity.refuse_other(state, self._folder.state)
             self.progress = Progress(**state["progress"])
             self.validations = json.loads(state["validations"])

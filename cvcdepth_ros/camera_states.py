@@ -113,7 +113,7 @@ class CameraWatch:
     def resume_listening(self) -> None:
         """Count silence from now on: nobody could take images until now."""
         with self._lock:
-            self._listening_since = self._clock()
+            self._listening_since = self._matched_at = self._clock()
 
     @property
     def seconds_since_image(self) -> float | None:

@@ -231,10 +231,14 @@ class SurroundDepthNode(ManagedNode):
         but a minute where the network is compiled.
         """
         parameters.check_complete()
-        estimator = self._built_estimator(parameters)
         session = self._session
-        if session is not None:
-            self.wait_for(lambda: session.set_model(estimator))
+        try:
+            estimator = self._built_estimator(parameters)
+            if session is not None:
+                self.wait_for(lambda: session.set_model(estimator))
+        finally:
+            if session is not None:
+                session.resume_listening()
         self._settings, self._estimator = parameters, estimator
         return_memory()
 

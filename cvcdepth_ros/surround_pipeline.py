@@ -112,9 +112,7 @@ class SurroundPipeline:
     def set_rig(self, rig: Rig | None) -> None:
         """Use these calibrations and cameras from now on; None: no set can be used until there is a rig again."""
         self._rig = rig
-        build = None if rig is None else self._preparer.pool.submit(self._build_and_warm_up, rig, self._estimator)
-        self._builds = [*(running for running in self._builds if not running.done()), *([build] if build else [])]
-        self._use(build)
+        self._use(None if rig is None else self._preparer.pool.submit(self._build_and_warm_up, rig, self._estimator))
 
     def set_model(self, estimator: DepthPredictor) -> None:
         """Use another network from the next set on; it is warmed up here, while the former one still runs.
@@ -125,6 +123,7 @@ class SurroundPipeline:
             build: Future[_Build] = Future()
             build.set_result(self._build_surround(self._rig, estimator))
             self._warm_up(build.result().surround)
+            self._last_built = build.result().surround or self._last_built
             self._use(build)
         self._estimator = estimator
 
@@ -151,6 +150,7 @@ class SurroundPipeline:
 
     def _use(self, build: Future[_Build] | None) -> None:
         former, self._build = self._build, build
+        self._builds = [b for b in (*self._builds, build) if b is not None and not b.done()]
         if former is not None:
             former.cancel()  # whoever sends new calibrations faster than maps can be built piles nothing up
 
@@ -166,6 +166,7 @@ class SurroundPipeline:
 
     def _build_and_warm_up(self, rig: Rig, estimator: DepthPredictor) -> _Build:
         build = self._build_surround(rig, estimator)
+        self._last_built = build.surround or self._last_built
         with suppress(EngineError):  # the first set will tell
             self._warm_up(build.surround)
         return build
@@ -183,7 +184,6 @@ class SurroundPipeline:
             if len(usable) < self._synchroniser.required:
                 return _Build(None, problems)
             surround = SurroundDepthEstimator(rig.only(usable), estimator, self._last_built)
-        self._last_built = surround
         return _Build(surround, problems)
 
     def _warm_up(self, surround: SurroundDepthEstimator | None) -> None:

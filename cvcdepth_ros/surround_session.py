@@ -29,7 +29,7 @@ from cvcdepth_ros.outputs import SurroundOutputs
 from cvcdepth_ros.picture_preparation import CameraImage
 from cvcdepth_ros.rig_assembly import RigAssembler
 from cvcdepth_ros.surround_pipeline import PublishedSet, SurroundPipeline
-from cvcdepth_ros.synchronizer import SurroundSynchronizer
+from cvcdepth_ros.synchronizer import NANOSECONDS, SurroundSynchronizer
 from cvcdepth_ros.trace_file import TraceFile
 
 
@@ -58,6 +58,7 @@ class SurroundSession:
         self._overlaps: OverlapMonitor | None = None
         self._monitored_rig: Rig | None = None
         self._max_image_mb = parameters.max_image_mb
+        self._offsets_ns = {camera.name: round(camera.stamp_offset * NANOSECONDS) for camera in layout.cameras}
         self._synchronisation = SynchronisationStatus(parameters.max_age)
         self._is_finished = False
         with ExitStack() as opened:
@@ -91,10 +92,13 @@ class SurroundSession:
         self._inputs.connect()
 
     def set_model(self, estimator: DepthEstimator) -> None:
-        """Use another network from the next set on; EngineError when it cannot run. No image is received meanwhile."""
+        """Use another network from the next set on; EngineError when it cannot run."""
         self._pipeline.set_model(estimator)
         self._estimator = estimator
         self._monitored_rig = None  # what was usual for the former network need not be for this one
+
+    def resume_listening(self) -> None:
+        """Hold no silence against the cameras: the executor was busy, and took no image until now."""
         for watch in self._watches.values():
             watch.resume_listening()
 
@@ -155,7 +159,8 @@ class SurroundSession:
         self._is_finished = self._pipeline.close()
 
     def _on_image(self, camera: str, message: Any) -> None:
-        self.latencies.record("receive (ROS time)", (self._ros_time() - stamp_ns(message)) / 1e9)
+        taken = stamp_ns(message) - self._offsets_ns[camera]
+        self.latencies.record("receive (ROS time)", (self._ros_time() - taken) / NANOSECONDS)
         megabytes = len(message.data) / 1e6
         if megabytes > self._max_image_mb:
             self._watches[camera].used(f"image of {megabytes:.1f} MB, more than max_image_mb ({self._max_image_mb:g})")

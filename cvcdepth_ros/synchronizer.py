@@ -18,9 +18,9 @@ older than those used are dropped. If not, the anchor image is dropped and the o
 
 **With missing cameras.** `min_cameras` lets sets leave that lack cameras. A camera is then no longer waited for once
 its newest image lies more than three periods behind the anchor's newest; it takes part again with its next image. The
-anchor itself is missing when so many others as a set needs are that far ahead of it, and of no use when most cameras,
-all of which send images, lie that far behind it: then its clock is wrong. The first camera of which neither is true
-stands in until the anchor returns. Of images that are farther apart than the tolerance, those farthest from the anchor
+anchor itself is missing when so many others as a set needs are that far ahead of it, and of no use when most cameras
+that send new images lie that far behind it: then its clock is wrong. The first camera of which neither is true stands
+in until the anchor returns. Of images that are farther apart than the tolerance, those farthest from the anchor
 stay behind.
 
 **When.** As soon as waiting cannot bring a nearer image: every camera has sent one at or after the anchor's stamp, or
@@ -211,10 +211,10 @@ class SurroundSynchronizer(Generic[T]):
                 self._streams[acting].drop_before(self._last_stamp + 1)  # sets come in increasing time
 
     def _is_ahead(self, camera: str) -> bool:
-        """Whether most cameras send images whose stamps lie so far behind this one's that its clock must be wrong."""
+        """Whether most of those that send lie so far behind this one with their stamps that its clock must be wrong."""
         stream = self._streams[camera]
-        behind = [s for s in self._streams.values() if _is_missing(s, stream) and s.has_sent_since(stream)]
-        return 2 * len(behind) > len(self._streams)
+        sending = [other for other in self._streams.values() if other.has_sent_since(stream)]
+        return 2 * sum(_is_missing(other, stream) for other in sending) > len(sending)
 
     def _is_left_behind(self, camera: str, ahead: Collection[str]) -> bool:
         """Whether enough others for a set have gone on without this camera, not counting those with a wrong clock."""
@@ -287,7 +287,6 @@ class _Stream(Generic[T]):
     def accept(self, stamp: int, image: T, arrival: int) -> None:
         """Queue the image, or count why not; `arrival` counts the images of all cameras."""
         self._received += 1
-        self._arrivals.append(arrival)
         if self._steps_back(stamp):
             self._clock_steps += 1
             self.clear("clock_jump")
@@ -296,6 +295,7 @@ class _Stream(Generic[T]):
         elif self._floor is not None and stamp <= self._floor:
             self._dropped["out_of_order"] += 1
         else:
+            self._arrivals.append(arrival)
             self._observe(stamp)
             insort(self.stamps, stamp)
             self._images[stamp] = image
@@ -323,7 +323,7 @@ class _Stream(Generic[T]):
         return _distance(self.newest + self.period, anchor) < _distance(stamp, anchor)
 
     def has_sent_since(self, other: "_Stream[T]") -> bool:
-        """Whether an image has come since the other camera's last few: what sends nothing has no wrong clock."""
+        """Whether a new image has come since the other camera's last few: what sends none has no wrong clock."""
         return bool(self._arrivals and other._arrivals) and self._arrivals[-1] > other._arrivals[0]
 
     def take(self, stamp: int) -> T:

@@ -2,6 +2,8 @@
 """Results are on the disk whole or not at all."""
 
 import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -43,6 +45,12 @@ def test_a_link_stays_a_link_and_a_pipe_a_pipe(tmp_path):
     assert os.read(reader, 100) == b"written"
     os.close(reader)
     assert pipe.is_fifo()
+
+
+def test_piped_output_is_written():
+    code = "import pathlib, cvcdepth_core.atomic_file as f; f.write_atomically(pathlib.Path('/dev/stdout'), b'written')"
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+    assert done.stdout == b"written"
 
 
 def test_a_full_disk_is_told_by_the_files_name_and_leaves_what_was_there(tmp_path, monkeypatch):

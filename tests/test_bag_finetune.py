@@ -167,6 +167,15 @@ def test_what_was_promoted_stays_when_the_run_goes_on_to_weights_that_are_not(be
     assert "; these are weights of a former call, those of this one are not proven to be better than" in reason
 
 
+def test_weights_of_a_run_whose_state_was_removed_are_not_taken_for_this_ones(config, tmp_path):
+    best = tmp_path / "run" / "best.safetensors"
+    best.parent.mkdir()
+    best.write_bytes(b"learned from other recordings")
+    one_step = config(optimizer={"epochs": 1, "samples_per_step": 9}, recordings={"held_out": 0, "min_travel": 0.1})
+    assert finetune(one_step, tmp_path / "run", *CHEAP) == NOT_PROMOTED
+    assert not best.exists()
+
+
 def test_weights_that_are_not_proven_better_are_not_promoted_and_the_exit_code_says_so(worse):
     assert worse.code == NOT_PROMOTED
     assert not (worse.folder / "best.safetensors").exists()

@@ -583,6 +583,15 @@ def test_results_that_were_measured_differently_are_compared_with_a_warning(
     assert main(["evaluate", "--compare", near, other]) == 0
     assert "were measured differently (lidar_tolerance)" in capsys.readouterr().err
 
+    content = json.loads(Path(far).read_text())
+    content["recordings"][0]["lidar"] = [
+        "/surround_depth/points"
+    ]  # what was found before colours told a camera's cloud
+    Path(far).write_text(json.dumps(content))
+    assert main(["evaluate", "--compare", near, far]) == 0
+    name = content["recordings"][0]["name"]
+    assert f"were measured differently (lidar of {name})" in capsys.readouterr().err
+
 
 def test_results_of_different_limits_are_not_compared(
     output: Path, two_sets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -2,8 +2,10 @@
 """The node's pipeline without ROS: real messages in, published sets out, on real threads."""
 
 import copy
+import gc
 import threading
 import time
+import weakref
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -339,6 +341,19 @@ def test_another_network_is_warmed_up_before_it_gets_a_set(start, estimator, ima
     assert slowed.warmed_up == [6]
     running.feed(images[:12])
     running.wait(lambda: slowed.cameras)
+
+
+def test_a_network_that_was_replaced_or_refused_is_let_go(start, estimator):
+    former, refused = Slowed(estimator), Failing(estimator)
+    running = start(former)
+    running.wait(lambda: running.pipeline._build.done())
+    with pytest.raises(EngineError):
+        running.pipeline.set_model(refused)
+    running.pipeline.set_model(estimator)
+    gone = [weakref.ref(network) for network in (former, refused)]
+    del former, refused
+    gc.collect()
+    assert [network() for network in gone] == [None, None]
 
 
 @pytest.fixture

@@ -662,6 +662,26 @@ def test_a_camera_whose_clock_is_ahead_costs_its_own_images_only_even_when_it_is
     assert [(s.anchor, len(s.images)) for s in mended][-5:] == [("front", 6)] * 5
 
 
+@pytest.mark.parametrize("min_cameras", [2, 3])
+def test_an_anchor_whose_clock_is_ahead_costs_nothing_more_where_other_cameras_are_dead(min_cameras: int):
+    synchronizer = partial_synchronizer(min_cameras)
+    alive = without("left", "right")
+    wrong = [(name, stamp + 36_000 * PERIOD * (name == "front")) for name, stamp in cycles(alive, 0, 20)]
+    sets = feed(synchronizer, wrong, flush=False)
+    assert [list(s.images) for s in sets[-10:]] == [["front_left", "back", "front_right"]] * 10
+
+
+def test_cameras_whose_stamps_stand_still_do_not_depose_the_others():
+    synchronizer = partial_synchronizer(2)
+    feed(synchronizer, cycles(PANDASET, 0, 5), flush=False)
+    moving = ("front", "front_left")
+    standing = [
+        (n, stamp if n in moving else (14 * PERIOD + PANDASET.index(n))) for n, stamp in cycles(PANDASET, 5, 20)
+    ]
+    sets = feed(synchronizer, standing, flush=False)
+    assert [list(s.images) for s in sets[-10:]] == [list(moving)] * 10
+
+
 def test_too_few_cameras_give_no_set():
     synchronizer = partial_synchronizer(4)
     assert feed(synchronizer, cycles(without("left", "back", "right"), 0, 10)) == []

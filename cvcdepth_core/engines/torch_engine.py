@@ -52,26 +52,27 @@ class TorchEngine:
 
 
 class PaddedBatches:
-    """Fills smaller batches up to the largest that has come: a compiled network is compiled anew for every size.
+    """Fills batches up to a size that has come before, of at most twice theirs: each size is compiled anew.
 
-    When a camera dies, the others must not wait for a compiler.
+    When a camera dies, the others must not wait for a compiler; where few cameras are wanted, few are computed.
     """
 
     def __init__(self, network: Callable[[Tensor], Tensor]) -> None:
         self._network = network
-        self._largest = 0
+        self._sizes: set[int] = set()
 
     def __call__(self, images: Tensor) -> Tensor:
         """Return what the network gives for these images."""
-        missing = max(0, self._largest - len(images))
-        padded = torch.cat([images, images.new_zeros(missing, *images.shape[1:])]) if missing else images
+        count = len(images)
+        size = min((known for known in self._sizes if count <= known <= 2 * count), default=count)
+        padded = torch.cat([images, images.new_zeros(size - count, *images.shape[1:])])
         try:
             given = self._network(padded.contiguous(memory_format=torch.channels_last))
         except RuntimeError:
-            self._largest = 0  # memory that held so many pictures may not do so for ever
+            self._sizes.discard(size)  # memory that held so many pictures may not do so for ever
             raise
-        self._largest = len(padded)
-        return given[: len(images)]
+        self._sizes.add(size)
+        return given[:count]
 
 
 class CudaGraphs:

@@ -137,6 +137,8 @@ class StoredResult:
     model_id: str
     scores: Scores
     configuration: Mapping[str, Any]
+    lidars: Mapping[str, Any]
+    """The topics that truth came from, by recording."""
 
     @classmethod
     def read(cls, path: Path) -> StoredResult:
@@ -145,11 +147,21 @@ class StoredResult:
             content = json.loads(path.read_text(encoding="utf-8"))
             schema, model_id, rows = content["schema"], content["model"]["id"], content["rows"]
             configuration = dict(content["configuration"])
+            lidars = {recording["name"]: recording["lidar"] for recording in content["recordings"]}
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ConfigError(f"{path}: not a metrics.json of evaluate: {error!r}") from error
         if schema != SCHEMA:
             raise ConfigError(f"{path}: schema is {schema}, expected {SCHEMA}")
-        return cls(str(model_id), Scores.from_json(rows), configuration)
+        return cls(str(model_id), Scores.from_json(rows), configuration, lidars)
+
+    def measured_differently(self, other: StoredResult) -> list[str]:
+        """Name what makes their numbers differ beside the models: options, and LiDARs that were found."""
+        options = [
+            name for name in _DECIDE_WHAT_IS_MEASURED if self.configuration.get(name) != other.configuration.get(name)
+        ]
+        common = self.lidars.keys() & other.lidars.keys()
+        found = [f"lidar of {name}" for name in sorted(common) if self.lidars[name] != other.lidars[name]]
+        return options + (found if "lidar" not in options else [])
 
 
 def comparison_to_json(first: StoredResult, second: StoredResult) -> dict[str, Any]:
@@ -161,9 +173,7 @@ def comparison_to_json(first: StoredResult, second: StoredResult) -> dict[str, A
         "second": second.model_id,
         **_without_differences(found["metric"]),
         "can_prove": found["metric"].can_prove,
-        "measured_differently": [
-            name for name in _DECIDE_WHAT_IS_MEASURED if first.configuration.get(name) != second.configuration.get(name)
-        ],
+        "measured_differently": first.measured_differently(second),
         "differences": {scaling: _differences(comparison) for scaling, comparison in found.items()},
     }
 

@@ -99,6 +99,8 @@ def fine_tune(order: Order, processes: Processes, tell: Tell) -> FineTuned | Non
         _keep_start(order, model)  # before the trainer fills the model with what a former call reached
     observers = [TensorBoardObserver(order.run)] if processes.is_first and has_tensorboard() else []
     trainer = _trainer(order, model, batches, parts, processes, observers, inputs_of(prepared, order.started_from))
+    if processes.is_first and trainer.progress.step == 0:
+        _forget_former_run(order.run)
     before = _scored(order, parts, order.run / START_FILE, "before") if parts else None
     try:
         trainer.train(quiet=order.quiet)
@@ -154,6 +156,12 @@ def _keep_start(order: Order, model: SurroundModel) -> None:
     found = load_checkpoint(path).metadata.get(_START_KEY)
     if found != order.started_from:
         raise CheckpointError(f"{order.run}: its run started from {found}, now it is {order.started_from}")
+
+
+def _forget_former_run(run: Path) -> None:
+    """Remove weights that a run left whose state somebody has removed: they may be of other recordings."""
+    for name in (BEST_FILE, CANDIDATE_FILE):
+        (run / name).unlink(missing_ok=True)
 
 
 def _scored(order: Order, parts: list[HeldOutPart], weights: Path, when: str) -> EvaluationResult:
