@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import (
     DurabilityPolicy,
@@ -23,7 +22,7 @@ from cvcdepth_core.errors import ConfigError, TransformError
 from cvcdepth_core.rig import CameraEntry, RigLayout
 from cvcdepth_ros.camera_discovery import COMPRESSED_IMAGE_TYPE, IMAGE_TYPE
 from cvcdepth_ros.camera_states import CameraState, Trouble
-from cvcdepth_ros.qos import input_qos, refusing_impossible_qos
+from cvcdepth_ros.qos import SubscriptionEventCallbacks, input_qos, refusing_impossible_qos
 from cvcdepth_ros.transforms import TransformTree
 
 _IMAGE_CLASSES = {IMAGE_TYPE: Image, COMPRESSED_IMAGE_TYPE: CompressedImage}

@@ -6,6 +6,11 @@ from contextlib import contextmanager
 
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
+try:
+    from rclpy.event_handler import SubscriptionEventCallbacks as SubscriptionEventCallbacks
+except ImportError:  # ROS 2 Humble calls the module so, and has no event for matching
+    from rclpy.qos_event import SubscriptionEventCallbacks as SubscriptionEventCallbacks
+
 from cvcdepth_core.errors import ConfigError
 
 _INPUT_DEPTH = 10

@@ -133,6 +133,7 @@ class Children:
             **os.environ,
             "ROS_DOMAIN_ID": self.domain,
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+            **({"ROS_LOCALHOST_ONLY": "1"} if os.environ.get("ROS_DISTRO") == "humble" else {}),  # which knows this one
             "PYTHONUNBUFFERED": "1",
         }
 

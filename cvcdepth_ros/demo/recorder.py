@@ -2,6 +2,7 @@
 """Record topics as they arrive, byte for byte, into a rosbag2 (MCAP) recording. Nothing else is stored."""
 
 import argparse
+import inspect
 import json
 import signal
 import sys
@@ -13,7 +14,6 @@ from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -25,11 +25,15 @@ from cvcdepth_ros.bags import RecordingWriter
 from cvcdepth_ros.demo.node_report import DIAGNOSTICS_TOPIC, read_report
 from cvcdepth_ros.messages import ros_message_class
 from cvcdepth_ros.process_setup import prepare_process
+from cvcdepth_ros.qos import SubscriptionEventCallbacks
 
 # Room for every message of several sets, so that a moment without the processor loses nothing.
 _QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.RELIABLE)
+# Others publish as their drivers did, and a reliable subscription does not match a publisher that is not.
+_INPUT_QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 _DIAGNOSTICS_TYPE = "diagnostic_msgs/msg/DiagnosticArray"
 _SPIN_SECONDS = 0.5
+_HAS_MATCHED_EVENTS = "matched" in inspect.signature(SubscriptionEventCallbacks).parameters
 
 _EXAMPLE = """example:
   python -m cvcdepth_ros.demo.recorder OUTPUT --topic /surround_depth/points sensor_msgs/msg/PointCloud2
@@ -58,16 +62,18 @@ class Recorder(Node):  # type: ignore[misc] # rclpy is not annotated
         self.received = dict.fromkeys([*topics, *inputs, DIAGNOSTICS_TOPIC], 0)
         self.lost = dict.fromkeys(self.received, 0)
         self.last_message = time.monotonic()
-        for topic, type_name in {**topics, **inputs}.items():
-            self._subscribe(topic, type_name)
+        for topic, type_name in topics.items():
+            self._subscribe(topic, type_name, _QOS)
+        for topic, type_name in inputs.items():
+            self._subscribe(topic, type_name, _INPUT_QOS)
         # Last of all. DDS makes subscriptions known in their order, so whoever reaches this one knows the others.
-        self._subscribe(DIAGNOSTICS_TOPIC, _DIAGNOSTICS_TYPE)
+        self._subscribe(DIAGNOSTICS_TOPIC, _DIAGNOSTICS_TYPE, _QOS)
 
     def summary(self) -> dict[str, Any]:
         """Say what has come, and which topics lost messages."""
         return {"received": self.received, "lost": {topic: count for topic, count in self.lost.items() if count}}
 
-    def _subscribe(self, topic: str, type_name: str) -> Subscription:
+    def _subscribe(self, topic: str, type_name: str, qos: QoSProfile) -> Subscription:
         self._writer.add_topic(topic, type_name)
 
         def matched(event: Any) -> None:
@@ -77,13 +83,16 @@ class Recorder(Node):  # type: ignore[misc] # rclpy is not annotated
         def message_lost(event: Any) -> None:
             self.lost[topic] += event.total_count_change
 
+        callbacks = SubscriptionEventCallbacks(message_lost=message_lost)
+        callbacks.matched = matched  # not an argument, which ROS 2 Humble does not have
+
         return self.create_subscription(
             self._message_class(type_name),
             topic,
             partial(self._store, topic),
-            _QOS,
+            qos,
             raw=True,
-            event_callbacks=SubscriptionEventCallbacks(matched=matched, message_lost=message_lost),
+            event_callbacks=callbacks,
         )
 
     @staticmethod
@@ -108,6 +117,8 @@ class Recorder(Node):  # type: ignore[misc] # rclpy is not annotated
         publishers, nothing that it publishes from now on can be missed.
         """
         report = read_report(deserialize_message(cdr, DiagnosticArray), self._watched)
+        if not _HAS_MATCHED_EVENTS:
+            self._unmatched = {topic for topic in self._unmatched if not self.count_publishers(topic)}
         if report is not None:
             self._tell({"ready": not self._unmatched, "node": report.model_dump(), **self.summary()})
 
