@@ -21,7 +21,7 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument("checkpoint", default_value="", description="Checkpoint file (safetensors)."),
             DeclareLaunchArgument("params_file", default_value=str(parameters), description="Parameter file (YAML)."),
             DeclareLaunchArgument("namespace", default_value="", description="Namespace of the node."),
-            DeclareLaunchArgument("use_sim_time", default_value="false", description="Take the time from /clock."),
+            DeclareLaunchArgument("use_sim_time", default_value="", description="Take the time from /clock."),
             OpaqueFunction(function=_start_node),
         ]
     )
@@ -31,7 +31,8 @@ def _start_node(context: LaunchContext) -> list[Node]:
     files = {name: LaunchConfiguration(name).perform(context) for name in ("rig", "checkpoint")}
     # As strings: a file name that looks like a number or a list must stay a file name.
     given = {name: ParameterValue(value, value_type=str) for name, value in files.items() if value}
-    sim_time = ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)
+    if LaunchConfiguration("use_sim_time").perform(context):
+        given["use_sim_time"] = ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)
     return [
         Node(
             package="cvcdepth_ros",
@@ -39,6 +40,6 @@ def _start_node(context: LaunchContext) -> list[Node]:
             name="surround_depth",
             namespace=LaunchConfiguration("namespace"),
             output="screen",
-            parameters=[LaunchConfiguration("params_file"), {**given, "use_sim_time": sim_time}],
+            parameters=[LaunchConfiguration("params_file"), *([given] if given else [])],
         )
     ]

@@ -68,7 +68,7 @@ def start(generate: Callable[[], Any], **given: str) -> Any:
 def test_arguments_left_empty_are_left_to_the_parameter_file(generate):
     node = start(generate)
     assert (node.options["package"], node.options["executable"]) == ("cvcdepth_ros", "surround_depth_node")
-    assert set(node.options["parameters"][1]) == {"use_sim_time"}
+    assert len(node.options["parameters"]) == 1
 
 
 def test_rig_and_checkpoint_have_precedence_over_the_parameter_file(generate):
@@ -77,6 +77,12 @@ def test_rig_and_checkpoint_have_precedence_over_the_parameter_file(generate):
     assert given["rig"].arguments == ("/data/rig.yaml",)
     # A file name that looks like a number stays a string.
     assert given["checkpoint"].options == {"value_type": str}
+    assert "use_sim_time" not in given
+
+
+def test_simulated_time_is_asked_for_as_a_boolean(generate):
+    (_, given) = start(generate, use_sim_time="true").options["parameters"]
+    assert given["use_sim_time"].options == {"value_type": bool}
 
 
 def test_every_argument_says_what_it_is_for(generate):
