@@ -77,30 +77,39 @@ def _masked_shares(camera: Camera) -> tuple[float, float]:
 def check_lidar(context: CheckContext) -> CheckResult:
     """Project a sweep of each LiDAR into every camera at the moment of its nearest image."""
     clouds = cloud_topics(context.recording)
-    missing = [topic for topic in context.lidars if topic not in clouds or topic not in context.sweeps]
-    if missing:
-        remedy = f"name a topic with point clouds; there are {', '.join(clouds) or 'none'}"
-        return CheckResult("failed", f"no sweep on {', '.join(missing)}", remedy, {"missing": missing})
+    silent = [topic for topic in context.lidars if topic not in clouds or topic not in context.sweeps]
+    if silent and context.options.lidar is not None:
+        there_are = f"in the whole recording there are {', '.join(clouds) or 'none'}"
+        remedy = f"name topics with point clouds in the part that is read; {there_are}"
+        return CheckResult("failed", f"no sweep on {', '.join(silent)}", remedy, {"missing": silent})
     if context.options.lidar == ():
         return CheckResult("skipped", "no LiDAR is wanted")
-    if not context.lidars:
+    result = _judged_lidars(context, [topic for topic in context.lidars if topic not in silent])
+    if silent:
+        remedy = "read a part that has sweeps, or name the LiDARs with --lidar"
+        return _worsened(result, f"no sweep on {', '.join(silent)} in this part", remedy)
+    return result
+
+
+def _judged_lidars(context: CheckContext, lidars: Sequence[str]) -> CheckResult:
+    if not lidars:
         remedy = "without a LiDAR, `evaluate` gives the label-free scores only"
         return _with_left_out(context, CheckResult("warning", "no LiDAR's point cloud is recorded", remedy))
     rig, assembler = context.rig, context.assembler
     if rig is None or assembler is None:
         return _NEEDS_RIG
-    shares, refusals = _projections(context, rig, assembler.transforms)
+    shares, refusals = _projections(context, lidars, rig, assembler.transforms)
     result = _judge_projection(shares) if shares else CheckResult("failed", "no sweep can be used")
     return _with_left_out(context, _with_refusals(result, refusals))
 
 
 def _projections(
-    context: CheckContext, rig: Rig, transforms: TransformTree
+    context: CheckContext, lidars: Sequence[str], rig: Rig, transforms: TransformTree
 ) -> tuple[dict[str, dict[str, float]], list[str]]:
     """Return what `_projected` says of each LiDAR, and why there is nothing to say of the others."""
     shares: dict[str, dict[str, float]] = {}
     refusals = []
-    for topic in context.lidars:
+    for topic in lidars:
         try:
             shares[topic] = _projected(context, rig, topic, transforms)
         except (RecordingError, TransformError) as error:
