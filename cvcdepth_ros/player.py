@@ -15,6 +15,7 @@ from typing import Any
 
 import rclpy
 from rclpy.duration import Duration
+from rclpy.exceptions import InvalidTopicNameException
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosReliability
@@ -62,13 +63,13 @@ class RecordingPlayer:
         self.statistics = PlayStatistics()
         self._stalled: set[str] = set()
         self.skipped: dict[str, str] = {}
-        """Topic -> type, where no message package for the type is installed."""
+        """Topic -> why it cannot be published."""
         self._node = rclpy.create_node("bag_replay", enable_rosout=False, start_parameter_services=False)
         self._clock = self._node.create_publisher(Clock, CLOCK_TOPIC, _DEFAULT_DEPTH) if clock else None
         self._publishers = dict(self._advertise(_chosen(recording, topics, clock)))
         if not self._publishers:
-            types = ", ".join(sorted(set(self.skipped.values())))
-            raise RecordingError(f"{recording.path}: nothing to play: no message package is installed for {types}")
+            reasons = ", ".join(sorted(set(self.skipped.values())))
+            raise RecordingError(f"{recording.path}: nothing to play: {reasons}")
 
     def __enter__(self) -> "RecordingPlayer":
         return self
@@ -112,10 +113,13 @@ class RecordingPlayer:
         for topic in topics:
             try:
                 message_class = ros_message_class(topic.type)
+                publisher = self._node.create_publisher(message_class, topic.name, offered_qos(topic))
             except (ImportError, AttributeError):
-                self.skipped[topic.name] = topic.type
+                self.skipped[topic.name] = f"no message package is installed for {topic.type}"
+            except (InvalidTopicNameException, ValueError):  # ROS 1 lets parts of names begin with digits
+                self.skipped[topic.name] = "no topic of ROS 2 may be called so"
             else:
-                yield topic.name, self._node.create_publisher(message_class, topic.name, offered_qos(topic))
+                yield topic.name, publisher
 
     def _latched(self) -> list[str]:
         latched = DurabilityPolicy.TRANSIENT_LOCAL

@@ -78,6 +78,8 @@ def test_help_and_version_load_neither_torch_nor_ros():
         "run drive.mcap -o depth --checkpoint w.safetensors --width 640",
         "run drive.mcap -o depth --untrained --depth-encoding 8UC1",
         "run drive.mcap -o depth --untrained --start soon",
+        "export model.safetensors --precision float16",
+        "export model.safetensors --tensorrt -o engine.plan",
         "play drive.mcap --rate 0",
         "play drive.mcap --duration -3",
     ],

@@ -376,6 +376,9 @@ def test_export_writes_a_checked_model_and_how_its_output_becomes_metres(checkpo
     expected = disparity_to_depth(torch.full((1, 1, 1), disparity), torch.tensor(fx), 0.5, 100.0)
     assert depth == pytest.approx(expected.item())
     assert main(["export", str(checkpoint)]) == 1
+    checkpoint.with_suffix(".onnx").unlink()
+    assert main(["export", str(checkpoint)]) == 1  # the description is there
+    assert main(["export", str(checkpoint), "-o", str(checkpoint.with_name("other.json"))]) == 1
     assert "model.onnx: exists already; --force overwrites it" in capsys.readouterr().err
 
 

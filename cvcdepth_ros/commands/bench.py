@@ -104,6 +104,8 @@ def _figures(paths: "DemoPaths", anchor: str, info: str, outcome: "LiveOutcome")
     depth = _arrivals(paths.recording, f"{_NODE}/{anchor}/{DEPTH}")
     if len(depth) < 3:
         raise RecordingError(f"only {len(depth)} sets came back: play more seconds")
+    if not sent.keys() & depth.keys():
+        raise RecordingError(f"none of the messages of {info} that belong to the depth was recorded")
     ages = np.array([(depth[stamp] - sent[stamp]) / 1e6 for stamp in depth.keys() & sent.keys()])
     intervals = np.diff(sorted(depth.values())) / 1e6
     # The recording's time and this machine's have nothing to do with each other.

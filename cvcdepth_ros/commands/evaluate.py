@@ -120,7 +120,8 @@ def _folders(arguments: argparse.Namespace) -> list[tuple[EvaluationSettings, Pa
     settings = [settings_from(one, EvaluationSettings) for one in given]
     if len(checkpoints) == 1:
         return [(settings[0], arguments.output)]
-    names = unique_names([(Path(checkpoint).stem, f"{i}") for i, checkpoint in enumerate(checkpoints, 1)])
+    stems = [Path(checkpoint).stem for checkpoint in checkpoints]
+    names = unique_names([(stem, f"{i}_{stem}") for i, stem in enumerate(stems, 1)])
     return [(one, arguments.output / name) for one, name in zip(settings, names, strict=True)]
 
 

@@ -31,12 +31,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("checkpoint", type=Path, metavar="CHECKPOINT", help="checkpoint file (safetensors)")
     parser.add_argument("-o", "--output", type=Path, metavar="OUT", help="ONNX file to write [CHECKPOINT.onnx]")
-    parser.add_argument("--force", action="store_true", help="overwrite the file")
+    parser.add_argument("--force", action="store_true", help="overwrite the files")
     parser.add_argument("--tensorrt", action="store_true", help="build a TensorRT engine instead")
     parser.add_argument(
-        "--precision", choices=("float32", "bfloat16", "float16"), default="float32", help="of TensorRT [float32]"
+        "--precision", choices=("float32", "bfloat16", "float16"), help="of the TensorRT engine [float32]"
     )
-    parser.add_argument("--device", default="cuda", metavar="TEXT", help="GPU to build for [cuda]")
+    parser.add_argument("--device", metavar="TEXT", help="GPU to build the TensorRT engine for [cuda]")
     add_json(parser)
 
 
@@ -44,9 +44,12 @@ def execute(arguments: argparse.Namespace) -> None:
     """Export, and tell what was written."""
     from cvcdepth_core.checkpoint import load_checkpoint
 
+    unused = ("output", "force") if arguments.tensorrt else ("precision", "device")
+    if given := [name for name in unused if getattr(arguments, name)]:
+        arguments.usage_error(f"--{given[0]} is {'not ' if arguments.tensorrt else ''}for --tensorrt")
     checkpoint = load_checkpoint(arguments.checkpoint)
     if arguments.tensorrt:
-        written, error = _build_tensorrt(checkpoint, arguments.precision, arguments.device)
+        written, error = _build_tensorrt(checkpoint, arguments.precision or "float32", arguments.device or "cuda")
     else:
         written, error = _write_onnx(checkpoint, arguments.output, arguments.force)
     result = _description(checkpoint) | {"file": str(written), "relative_depth_error": error}
@@ -58,12 +61,16 @@ def _write_onnx(checkpoint: "Checkpoint", output: Path | None, force: bool) -> t
     from cvcdepth_core.engines import export_onnx
 
     path = output or checkpoint.path.with_suffix(".onnx")
-    if path.exists() and not force:
-        raise ConfigError(f"{path}: exists already; --force overwrites it")
+    beside = path.with_suffix(".json")
+    if beside == path:
+        raise ConfigError(f"{path}: its description would take its place; choose another name")
+    for file in (path, beside):
+        if file.exists() and not force:
+            raise ConfigError(f"{file}: exists already; --force overwrites it")
     model, error = export_onnx(checkpoint.build_depth_net(), checkpoint.spec)
     write_atomically(path, model)
     description = json.dumps(_description(checkpoint), indent=2) + "\n"
-    write_atomically(path.with_suffix(".json"), description.encode())
+    write_atomically(beside, description.encode())
     return path, error
 
 

@@ -6,7 +6,7 @@ import signal
 import time
 from typing import TYPE_CHECKING, Any
 
-from cvcdepth_core.errors import ConfigError
+from cvcdepth_core.errors import ConfigError, RecordingError
 from cvcdepth_ros.commands.arguments import (
     add_json,
     add_recording,
@@ -80,8 +80,7 @@ def _play(recording: "Recording", arguments: argparse.Namespace) -> dict[str, An
     interrupted = False
     with RecordingPlayer(recording, arguments.topics, arguments.clock) as player:
         if player.skipped:
-            skipped = ", ".join(f"{topic} ({type_})" for topic, type_ in player.skipped.items())
-            warn(f"not played, for want of their message package: {skipped}")
+            warn(f"not played: {', '.join(f'{topic} ({reason})' for topic, reason in player.skipped.items())}")
         began = time.monotonic()
         try:
             _await_subscribers(player, arguments.wait_for_subscribers)
@@ -102,6 +101,8 @@ def _await_subscribers(player: "RecordingPlayer", seconds: float) -> None:
 def _play_through(player: "RecordingPlayer", recording: "Recording", arguments: argparse.Namespace) -> None:
     start, stop = window_ns(arguments, recording.start)
     player.play(start, stop, arguments.rate)
+    if not player.statistics.lateness:
+        raise RecordingError(f"{recording.path}: no message of these topics between --start and --duration")
     while arguments.loop:
         player.play(start, stop, arguments.rate)
     player.finish()

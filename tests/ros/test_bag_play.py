@@ -257,18 +257,31 @@ def clock_digest(log_time: int) -> str:
     return digest(bytes(JAZZY.serialize_cdr(JAZZY.types[type_](clock=time), type_)))
 
 
-def test_types_without_a_message_package_are_named_once_and_left_out(environment: dict[str, str], tmp_path: Path):
+def test_topics_that_cannot_be_published_are_named_once_and_left_out(environment: dict[str, str], tmp_path: Path):
     type_ = "made_up_msgs/msg/Thing"
     with RecordingWriter(tmp_path / "recording") as writer:
         writer.add_topic("/thing", type_, definition="uint8 x")
         writer.add_topic("/text", STRING)
+        writer.add_topic("/2d_lidar/text", STRING)
         for time in range(1, 4):
+            writer.write("/2d_lidar/text", time * 10**8, JAZZY.types[STRING](data="hello"))
             writer.write("/thing", time * 10**8, b"\x00\x01\x00\x00\x07")
             writer.write("/text", time * 10**8, JAZZY.types[STRING](data="hello"))
     result, errors = play(environment, tmp_path / "recording")
     assert result["published"] == {"/text": 3}
-    assert result["skipped"] == {"/thing": type_}
+    assert result["skipped"] == {
+        "/thing": f"no message package is installed for {type_}",
+        "/2d_lidar/text": "no topic of ROS 2 may be called so",
+    }
     assert errors.count("/thing") == 1
+
+
+@pytest.mark.parametrize("loop", [(), ("--loop",)])
+def test_a_part_without_messages_is_an_error(loop: tuple[str, ...], environment: dict[str, str]):
+    arguments = [sys.executable, "-m", "cvcdepth_ros.bag_replay", "play", str(SAMPLE), "--start", "100", *loop]
+    done = subprocess.run(arguments, env=environment, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 1
+    assert "no message of these topics between --start and --duration" in done.stderr
 
 
 def test_a_ros1_recording_is_played_as_ros2_messages(environment: dict[str, str], tmp_path: Path):
