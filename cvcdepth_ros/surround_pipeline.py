@@ -120,11 +120,12 @@ class SurroundPipeline:
         EngineError when it cannot run: then the former one stays.
         """
         if self._rig is not None:
-            build: Future[_Build] = Future()
-            build.set_result(self._build_surround(self._rig, estimator))
-            self._warm_up(build.result().surround)
-            self._last_built = build.result().surround or self._last_built
-            self._use(build)
+            build = self._build_surround(self._rig, estimator)
+            self._warm_up(build.surround)
+            self._last_built = build.surround or self._last_built
+            built: Future[_Build] = Future()
+            built.set_result(build)
+            self._use(built)
         self._estimator = estimator
 
     def add(self, camera: str, message: Any) -> None:
@@ -173,18 +174,16 @@ class SurroundPipeline:
 
     def _build_surround(self, rig: Rig, estimator: DepthPredictor) -> _Build:
         """Build the maps, taking over those of the cameras that have not changed."""
-        problems: dict[str, str] = {}
         try:
-            surround = SurroundDepthEstimator(rig, estimator, self._last_built)
+            return _Build(SurroundDepthEstimator(rig, estimator, self._last_built), {})
         except Exception:
             problems = _camera_problems(rig, estimator.spec)
             if not problems:
                 raise
-            usable = [name for name in rig.names if name not in problems]
-            if len(usable) < self._synchroniser.required:
-                return _Build(None, problems)
-            surround = SurroundDepthEstimator(rig.only(usable), estimator, self._last_built)
-        return _Build(surround, problems)
+        usable = [name for name in rig.names if name not in problems]
+        if len(usable) < self._synchroniser.required:
+            return _Build(None, problems)
+        return _Build(SurroundDepthEstimator(rig.only(usable), estimator, self._last_built), problems)
 
     def _warm_up(self, surround: SurroundDepthEstimator | None) -> None:
         """Have done what an engine does but once, unless it is; EngineError when it cannot run."""
