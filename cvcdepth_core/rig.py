@@ -89,6 +89,11 @@ class CameraEntry(BaseModel):
     neighbours: tuple[str, ...] | None = None
     """Cameras that see some of the same space; without it, computed from the fields of view."""
 
+    @property
+    def stamp_offset_ns(self) -> int:
+        """`stamp_offset` as stamps are counted: subtracted from one, it gives the time of the exposure."""
+        return round(self.stamp_offset * 10**9)
+
 
 class RigLayout(BaseModel):
     """The content of a rig file."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What runs while the node is active: its topics tied to the pipeline, and what is known of each camera."""
 
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -58,19 +58,19 @@ class SurroundSession:
         self._overlaps: OverlapMonitor | None = None
         self._monitored_rig: Rig | None = None
         self._max_image_mb = parameters.max_image_mb
-        self._offsets_ns = {camera.name: round(camera.stamp_offset * NANOSECONDS) for camera in layout.cameras}
+        self._offsets_ns = {camera.name: camera.stamp_offset_ns for camera in layout.cameras}
         self._synchronisation = SynchronisationStatus(parameters.max_age)
         self._is_finished = False
         with ExitStack() as opened:
-            trace = TraceFile(Path(parameters.trace).expanduser()) if parameters.trace else None
-            if trace is not None:
-                opened.callback(trace.close)
+            trace = None
+            if parameters.trace:
+                trace = opened.enter_context(closing(TraceFile(Path(parameters.trace).expanduser())))
             self.latencies = StageLatencies(trace)
             if any(camera.base_T_camera is None for camera in layout.cameras):
-                transforms = StaticTransformInput(node, self._assembler.transforms, self._on_transforms)
-                opened.callback(transforms.close)
-            self._outputs = SurroundOutputs(node, layout.names, parameters.depth_encoding, self.latencies)
-            opened.callback(self._outputs.close)
+                transforms = StaticTransformInput(node, assembler.transforms, self._on_transforms)
+                opened.enter_context(closing(transforms))
+            outputs = SurroundOutputs(node, layout.names, parameters.depth_encoding, self.latencies)
+            self._outputs = opened.enter_context(closing(outputs))
             self._pipeline = SurroundPipeline(
                 estimator,
                 self._synchroniser,
@@ -82,8 +82,8 @@ class SurroundSession:
                 self.latencies,
             )
             opened.callback(self._close_pipeline)
-            self._inputs = CameraInputs(node, layout, parameters.reliable, self._on_image, self._on_camera_info)
-            opened.callback(self._inputs.close)
+            inputs = CameraInputs(node, layout, parameters.reliable, self._on_image, self._on_camera_info)
+            self._inputs = opened.enter_context(closing(inputs))
             self._rebuild()
             self._opened = opened.pop_all()
 

@@ -43,8 +43,6 @@ class RecordingIndex:
     """The rig, complete."""
     stamps: NDArray[np.int64]
     """[S, N] each image's own stamp, ns: by which its message is told from others."""
-    times: NDArray[np.int64]
-    """[S, N] when each image was taken, ns: its stamp without its camera's offset."""
     log_times: NDArray[np.int64]
     """[S, N] when each image was recorded, ns: where it is found again."""
     poses: NDArray[np.float64] | None
@@ -55,6 +53,13 @@ class RecordingIndex:
     """Sets left out since the recorded motion does not reach them."""
     unread: tuple[str, ...] = ()
     """What of the recording could not be read or used, in words."""
+
+    @property
+    def times(self) -> NDArray[np.int64]:
+        """[S, N] when each image was taken, ns: its stamp without its camera's offset."""
+        offsets = np.array([camera.stamp_offset_ns for camera in self.layout.cameras], dtype=np.int64)
+        times: NDArray[np.int64] = self.stamps - offsets
+        return times
 
     @property
     def losses(self) -> list[str]:
@@ -108,7 +113,6 @@ def build_index(path: Location, matching: MatchingSettings, rig_layout: RigLayou
         path=path,
         layout=layout,
         stamps=_table(sets, placed, lambda found: [found.stamps_ns[name] for name in layout.names]),
-        times=_table(sets, placed, lambda found: [found.times_ns[name] for name in layout.names]),
         log_times=_table(sets, placed, lambda found: [found.images[name] for name in layout.names]),
         poses=None if poses is None else np.array([poses[i] for i in placed]).reshape(-1, len(layout.names), 4, 4),
         thumbnails=np.stack(thumbnails) if motion is None else None,
@@ -218,7 +222,7 @@ def _key(path: Location, matching: MatchingSettings, layout: RigLayout | None) -
 
 
 def _write(cached: Path, index: RecordingIndex, key: str) -> None:
-    arrays = {name: getattr(index, name) for name in ("stamps", "times", "log_times", "poses", "thumbnails")}
+    arrays = {name: getattr(index, name) for name in ("stamps", "log_times", "poses", "thumbnails")}
     content = io.BytesIO()
     np.savez_compressed(
         content,
@@ -241,7 +245,6 @@ def _read(cached: Path, path: Location, key: str) -> RecordingIndex | None:
                 path,
                 RigLayout.model_validate_json(str(kept["layout"])),
                 kept["stamps"],
-                kept["times"],
                 kept["log_times"],
                 kept.get("poses"),
                 kept.get("thumbnails"),

@@ -20,7 +20,7 @@ from cvcdepth_ros.lidar import VehicleMotion, find_lidars
 from cvcdepth_ros.messages import picture_from_message
 from cvcdepth_ros.recorded_rig import IMAGE_TYPES, collect_rig, discover_layout
 from cvcdepth_ros.rig_assembly import RigAssembler
-from cvcdepth_ros.synchronizer import NANOSECONDS, SurroundSet, SurroundSynchronizer
+from cvcdepth_ros.synchronizer import SurroundSet, SurroundSynchronizer
 from cvcdepth_ros.topic_timing import TopicTiming
 
 Status = Literal["passed", "warning", "failed", "skipped"]
@@ -130,7 +130,7 @@ class CheckContext:
     def times(self, camera: str) -> NDArray[np.int64]:
         """Return when a camera's images were taken [M], ns, sorted: their stamps without the camera's offset."""
         entries = self.assembler.layout.cameras if self.assembler else ()
-        offsets = {entry.name: round(entry.stamp_offset * NANOSECONDS) for entry in entries}
+        offsets = {entry.name: entry.stamp_offset_ns for entry in entries}
         return self.stamps(camera) - offsets[camera]
 
     def match(
