@@ -3,8 +3,11 @@
 
 from __future__ import annotations
 
+import json
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from cvcdepth_core.errors import OutputError
 
@@ -29,6 +32,11 @@ def write_atomically(path: Path, content: bytes) -> None:
     except OSError as error:
         temporary.unlink(missing_ok=True)
         raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a result as `write_atomically` does."""
+    write_atomically(path, f"{json.dumps(content, indent=2)}\n".encode())
 
 
 def _flush_directory(directory: Path) -> None:

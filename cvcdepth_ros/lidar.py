@@ -57,6 +57,11 @@ def find_lidars(recording: Recording) -> tuple[tuple[str, ...], tuple[str, ...]]
     return tuple(topic for topic in clouds if topic not in of_cameras), of_cameras
 
 
+def told_of_cameras(topics: Sequence[str]) -> str:
+    """Say why these clouds, the second that `find_lidars` returns, are no LiDAR's."""
+    return f"not taken for a LiDAR's, since their points have colours: {', '.join(topics)}"
+
+
 class VehicleMotion:
     """Where the vehicle was over time: a moving link of `/tf`, or an odometry topic."""
 

@@ -14,7 +14,7 @@ from cvcdepth_core.ground_truth import PinholeView
 from cvcdepth_core.preprocess import Rectifier, self_occlusion_mask
 from cvcdepth_core.rig import Camera, Rig
 from cvcdepth_ros.checks.context import CheckContext, CheckResult, Status
-from cvcdepth_ros.lidar import LidarSweeps, cloud_topics
+from cvcdepth_ros.lidar import LidarSweeps, cloud_topics, told_of_cameras
 from cvcdepth_ros.messages import stamp_ns
 from cvcdepth_ros.synchronizer import NANOSECONDS
 from cvcdepth_ros.transforms import TransformTree
@@ -127,7 +127,7 @@ def _with_refusals(result: CheckResult, refusals: Sequence[str]) -> CheckResult:
 def _with_left_out(context: CheckContext, result: CheckResult) -> CheckResult:
     if not context.clouds_of_cameras:
         return result
-    finding = f"not taken for a LiDAR's, since their points have colours: {', '.join(context.clouds_of_cameras)}"
+    finding = told_of_cameras(context.clouds_of_cameras)
     return _worsened(result, finding, "name the LiDARs with --lidar, and nothing else is looked at")
 
 

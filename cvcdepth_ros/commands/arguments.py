@@ -8,11 +8,13 @@ import sys
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin
 
 from pydantic import ValidationError
 
 from cvcdepth_core.calibration import first_validation_message
+from cvcdepth_core.errors import ConfigError
 from cvcdepth_ros.settings import ModelSettings
 
 if TYPE_CHECKING:
@@ -39,6 +41,13 @@ def add_recordings(parser: argparse.ArgumentParser, required: bool = True) -> No
 def add_quiet(parser: argparse.ArgumentParser) -> None:
     """Declare `--quiet`."""
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def refuse_to_overwrite(*files: Path) -> None:
+    """Raise ConfigError, naming the file, for the first that is there; for commands that take `--force`."""
+    for path in files:
+        if path.exists():
+            raise ConfigError(f"{path}: exists already; --force overwrites it")
 
 
 def add_lidar(parser: argparse.ArgumentParser) -> None:

@@ -3,14 +3,13 @@
 
 import argparse
 import json
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cvcdepth_core.atomic_file import write_atomically
+from cvcdepth_core.atomic_file import write_atomically, write_json
 from cvcdepth_ros.commands.arguments import (
     add_json,
     add_lidar,
@@ -25,7 +24,7 @@ from cvcdepth_ros.commands.arguments import (
     table,
     warn,
 )
-from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings
+from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings, unique_names
 
 if TYPE_CHECKING:
     from cvcdepth_core.scores import Score
@@ -105,7 +104,7 @@ def _evaluation(arguments: argparse.Namespace) -> "tuple[dict[str, Any], str]":
     compared = []
     for folder, *_ in others:
         content, text = _comparison(first / _METRICS_FILE, folder / _METRICS_FILE)
-        write_atomically(folder / _COMPARISON_FILE, f"{json.dumps(content, indent=2)}\n".encode())
+        write_json(folder / _COMPARISON_FILE, content)
         compared.append((content, text))
     results = {"evaluations": [content for _, content, _ in found], "comparisons": [content for content, _ in compared]}
     return results, "\n\n".join([text for *_, text in found] + [text for _, text in compared])
@@ -201,20 +200,16 @@ def _comparison(first: Path, second: Path) -> tuple[dict[str, Any], str]:
     return content, _comparison_text(content)
 
 
-def unique_names(candidates: Sequence[tuple[str, str]]) -> list[str]:
-    """Return each candidate's short name, with the long one in its place where several have the same short one."""
-    counts = Counter(short for short, _ in candidates)
-    return [short if counts[short] == 1 else long for short, long in candidates]
-
-
 def _warn_of_losses(job: EvaluationJob, scores: "RecordingScores") -> None:
+    from cvcdepth_ros.lidar import told_of_cameras
+
     damage, sets = scores.summary["damage"], scores.summary["sets"]["scored"]
     if damage:
         seconds = scores.summary["seconds"]
         warn(f"{job.path}: not everything could be read: {damage}; evaluated {sets} sets of the {seconds:.1f} s there")
     left_out = scores.summary["clouds_of_cameras"]
     if left_out:
-        warn(f"{job.path}: not taken for a LiDAR's, since their points have colours: {', '.join(left_out)}")
+        warn(f"{job.path}: {told_of_cameras(left_out)}")
     refusals = scores.summary["truth_refused"]
     if refusals["count"]:
         warn(f"{job.path}: {refusals['count']} times no truth, the first: {refusals['reasons'][0]}")

@@ -2,12 +2,11 @@
 """`export`: the depth network for other programs, and for TensorRT."""
 
 import argparse
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from cvcdepth_core.errors import ConfigError
-from cvcdepth_ros.commands.arguments import add_json, print_result
+from cvcdepth_ros.commands.arguments import add_json, print_result, refuse_to_overwrite
 from cvcdepth_ros.version import package_version
 
 if TYPE_CHECKING:
@@ -57,20 +56,18 @@ def execute(arguments: argparse.Namespace) -> None:
 
 
 def _write_onnx(checkpoint: "Checkpoint", output: Path | None, force: bool) -> tuple[Path, float]:
-    from cvcdepth_core.atomic_file import write_atomically
+    from cvcdepth_core.atomic_file import write_atomically, write_json
     from cvcdepth_core.engines import export_onnx
 
     path = output or checkpoint.path.with_suffix(".onnx")
     beside = path.with_suffix(".json")
     if beside == path:
         raise ConfigError(f"{path}: its description would take its place; choose another name")
-    for file in (path, beside):
-        if file.exists() and not force:
-            raise ConfigError(f"{file}: exists already; --force overwrites it")
+    if not force:
+        refuse_to_overwrite(path, beside)
     model, error = export_onnx(checkpoint.build_depth_net(), checkpoint.spec)
     write_atomically(path, model)
-    description = json.dumps(_description(checkpoint), indent=2) + "\n"
-    write_atomically(beside, description.encode())
+    write_json(beside, _description(checkpoint))
     return path, error
 
 

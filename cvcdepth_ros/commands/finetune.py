@@ -5,6 +5,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from cvcdepth_core.atomic_file import write_json
 from cvcdepth_core.errors import ConfigError, NotPromotedError
 from cvcdepth_ros.commands.arguments import (
     add_json,
@@ -119,7 +120,6 @@ def _order(arguments: argparse.Namespace) -> "Order":
 def _written(tuned: "FineTuned", with_report: bool) -> dict[str, Any]:
     """Write the card, the page if wanted, and the result; return the result."""
     from cvcdepth_ros.finetuning.card import model_card, write_card
-    from cvcdepth_ros.finetuning.run import write_json
 
     run, card = tuned.order.run, model_card(tuned)
     write_card(run, card)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cvcdepth_core.errors import ConfigError
-from cvcdepth_ros.commands.arguments import add_json, add_recording, print_result, table
+from cvcdepth_ros.commands.arguments import add_json, add_recording, print_result, refuse_to_overwrite, table
 from cvcdepth_ros.version import package_version
 
 if TYPE_CHECKING:
@@ -45,26 +45,22 @@ def execute(arguments: argparse.Namespace) -> None:
     from cvcdepth_ros.bags import open_recording
     from cvcdepth_ros.recorded_rig import discover_rig
 
-    _refuse_to_overwrite([] if arguments.force else [arguments.output])
+    if not arguments.force:
+        refuse_to_overwrite(arguments.output)
     with open_recording(arguments.recording) as recording:
         layout = discover_rig(recording, arguments.base_frame)
         path = recording.path
     layout = layout.model_copy(update={"anchor": _anchor(layout, arguments.anchor)})
     if arguments.masks:
         folder = arguments.output.parent / f"{arguments.output.stem}_masks"
-        _refuse_to_overwrite([] if arguments.force else [folder / f"{name}.png" for name in layout.names])
+        if not arguments.force:
+            refuse_to_overwrite(*(folder / f"{name}.png" for name in layout.names))
         layout = _with_found_masks(layout, path, folder)
     result = _describe(layout, layout.complete())
     source = f"bag_replay rig {package_version()}, from the recording {path.name}"
     save_rig_layout(arguments.output, layout, f"Written by {source}.\n{_overlaps_text(result)}")
     result = {"file": str(arguments.output), "recording": arguments.recording, **result}
     print_result(result, _text(result), arguments.json)
-
-
-def _refuse_to_overwrite(files: list[Path]) -> None:
-    for path in files:
-        if path.exists():
-            raise ConfigError(f"{path}: exists already; --force overwrites it")
 
 
 def _with_found_masks(layout: "RigLayout", recording: "Location", folder: Path) -> "RigLayout":

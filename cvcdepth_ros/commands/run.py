@@ -2,7 +2,6 @@
 """`run`: compute depth for a whole recording and store it in another."""
 
 import argparse
-import json
 import shutil
 import signal
 import threading
@@ -13,7 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from cvcdepth_core.atomic_file import write_atomically
+from cvcdepth_core.atomic_file import write_json
 from cvcdepth_core.errors import RecordingError
 from cvcdepth_ros.commands.arguments import (
     add_json,
@@ -96,7 +95,7 @@ def execute(arguments: argparse.Namespace) -> None:
             **outcome,
             "damage": recording.damage,
         }
-    write_atomically(arguments.output / _RESULT_FILE, f"{json.dumps(result, indent=2)}\n".encode())
+    write_json(arguments.output / _RESULT_FILE, result)
     print_result(result, _text(result), arguments.json)
     if result["interrupted"]:
         raise KeyboardInterrupt

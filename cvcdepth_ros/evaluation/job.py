@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -125,3 +127,9 @@ class EvaluationJob:
             "base_frame": self.layout.base_frame if self.layout else self.base_frame,
             "rig": self.layout.model_dump(mode="json", exclude_defaults=True) if self.layout else None,
         }
+
+
+def unique_names(candidates: Sequence[tuple[str, str]]) -> list[str]:
+    """Return each candidate's short name, with the long one in its place where several have the same short one."""
+    counts = Counter(short for short, _ in candidates)
+    return [short if counts[short] == 1 else long for short, long in candidates]

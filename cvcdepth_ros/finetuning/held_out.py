@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from cvcdepth_core.training_config import TrainingConfig
 from cvcdepth_ros.bags import open_recording
-from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings
+from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings, unique_names
 from cvcdepth_ros.evaluation.result import EvaluationResult
 from cvcdepth_ros.evaluation.workers import KeptParts, evaluate_all
 from cvcdepth_ros.synchronizer import NANOSECONDS
@@ -55,11 +55,10 @@ def held_out_parts(
             "threads": torch.get_num_threads(),
         }
     )
-    names = [index.path.name for index in indexes]
+    names = unique_names([(index.path.name, str(index.path)) for index in indexes])
     parts = []
     for index, name in zip(indexes, names, strict=True):
-        unique = name if names.count(name) == 1 else str(index.path)
-        job = EvaluationJob(unique, str(index.path), settings, index.layout, lidar=lidar)
+        job = EvaluationJob(name, str(index.path), settings, index.layout, lidar=lidar)
         part = _held_out_part(index, job, config)
         if part is not None:
             parts.append(part)

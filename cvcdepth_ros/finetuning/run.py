@@ -3,11 +3,9 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from cvcdepth_core.atomic_file import write_atomically
 from cvcdepth_core.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
@@ -81,14 +79,8 @@ def fine_tune(order: Order, processes: Processes, tell: Tell) -> FineTuned | Non
     """
     with processes.first_goes_ahead():
         prepared = prepare(order.source, order.run)
-    prepared.warnings += [
-        f"{index.path}: {told}"
-        for index in prepared.indexes
-        if (told := told_beyond_reach(index, order.config.recordings))
-    ]
     if processes.is_first:
-        for text in (*(f"left out: {reason}" for reason in prepared.left_out.values()), *prepared.warnings):
-            tell(text)
+        _tell_of_losses(prepared, order, tell)
     batches = RecordingBatches(prepared.indexes, order.config, processes)
     model = build_surround_model(order.config, order.start)
     device = own_device(resolve_device(order.device))
@@ -112,6 +104,15 @@ def fine_tune(order: Order, processes: Processes, tell: Tell) -> FineTuned | Non
     weights, after, verdict = _judged(order, parts, before)
     samples = [sum(sample.recording == i for sample in batches.reader.samples) for i in range(len(prepared.indexes))]
     return FineTuned(order, prepared, trainer, samples, parts, weights, before, after, verdict)
+
+
+def _tell_of_losses(prepared: Prepared, order: Order, tell: Tell) -> None:
+    """Tell what of the recordings is not trained on, and keep it for the report."""
+    for index in prepared.indexes:
+        if told := told_beyond_reach(index, order.config.recordings):
+            prepared.warnings.append(f"{index.path}: {told}")
+    for text in (*(f"left out: {reason}" for reason in prepared.left_out.values()), *prepared.warnings):
+        tell(text)
 
 
 def _trainer(
@@ -191,8 +192,3 @@ def _judged(
             reason = f"{former.reason}; these are weights of a former call, those of this one are {verdict.reason}"
             return best, proven, replace(former, reason=reason)
     return weights, after, verdict
-
-
-def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write a result that appears whole or not at all."""
-    write_atomically(path, (json.dumps(content, indent=2) + "\n").encode())
