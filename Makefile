@@ -11,13 +11,13 @@ key = $(shell { echo "$(TORCH)"; cat requirements/$(1).lock setup.py; } | sha256
 DEMO := .venv/installed/demo-$(call key,demo)
 DEV := .venv/installed/dev-$(call key,dev)
 CORE := .venv-core/installed/core_test-$(call key,core_test)
-TF2 := .venv/installed/tf2_msgs-$(shell cat tests/tf2_msgs/*.* tests/tf2_msgs/msg/* | sha256sum | cut -c1-12)
+TF2 := .venv/installed/tf2_msgs-$(shell cat tests/support/tf2_msgs/*.* tests/support/tf2_msgs/msg/* | sha256sum | cut -c1-12)
 
 # Two tests at a time. A file's tests mostly stay in one process, which has the results that they share.
 BESIDE := -n 2 --dist worksteal
 
-NODE_FAULTS := tests/ros/test_node_faults.py tests/ros/test_lifecycle.py \
-  tests/ros/test_surround_depth_node.py::test_transforms_that_make_no_tree_are_refused_by_name_and_the_others_taken
+NODE_FAULTS := tests/with_ros/node/test_node_faults.py tests/with_ros/node/test_lifecycle.py \
+  tests/with_ros/node/test_surround_depth_node.py::test_transforms_that_make_no_tree_are_refused_by_name_and_the_others_taken
 
 BENCHMARKS := $(filter-out measuring table camera_loop,$(basename $(notdir $(wildcard benchmarks/*.py))))
 
@@ -54,12 +54,12 @@ lint: $(DEV) ## ruff and mypy
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
 
-test-ros: $(DEV) tf2_msgs ## the tests in tests/ros, with ROS 2 from wheels
-	.venv/bin/python -m pytest $(BESIDE) tests/ros
+test-ros: $(DEV) tf2_msgs ## the tests in tests/with_ros, with ROS 2 from wheels
+	.venv/bin/python -m pytest $(BESIDE) tests/with_ros
 
 test-core: $(CORE) ## all other tests, in an environment without ROS
 	@if .venv-core/bin/python -c 'import rclpy' 2>/dev/null; then echo "rclpy is in .venv-core: make clean"; exit 1; fi
-	.venv-core/bin/python -m pytest $(BESIDE) --ignore tests/ros
+	.venv-core/bin/python -m pytest $(BESIDE) --ignore tests/with_ros
 
 test-faults: $(DEV) ## inject every fault into node and tool; the table of reactions in output/faults.md
 	@mkdir -p output && rm -f output/faults.md
@@ -74,7 +74,7 @@ soak: $(DEV) ## feed the node with faults for MINUTES=60 and watch memory, files
 	.venv/bin/python tools/soak.py --minutes $(or $(MINUTES),60) --output output/soak.json
 
 tf2_msgs: $(DEV) ## build tf2_msgs, which has no wheel, for the tests of /tf_static (needs g++)
-	@test -e $(TF2) || .venv/bin/python tests/tf2_msgs/build.py $(TF2)
+	@test -e $(TF2) || .venv/bin/python tests/support/tf2_msgs/build.py $(TF2)
 
 lock: .venv-lock/bin/uv ## resolve requirements/*.in again (LOCK=--upgrade for newer versions)
 	$(call compile,dev) $(LOCK)

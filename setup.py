@@ -7,7 +7,7 @@ from setuptools import find_packages, setup
 
 NAME = "cvcdepth_ros"
 SHARE = Path("share") / NAME
-TEMPLATES = ["evaluation/report/templates/*", "finetuning/templates/*"]
+TEMPLATES = ["reports/templates/*"]
 # `colcon build --symlink-install` runs a link to this file elsewhere.
 REQUIREMENTS = Path(__file__).resolve().parent / "requirements"
 

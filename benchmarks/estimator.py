@@ -25,9 +25,9 @@ from measuring import Timings, json_lines, peak_memory_mb, print_line, times_qui
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from cvcdepth_core.checkpoint import DepthModelSpec
-    from cvcdepth_core.images import Picture
+    from cvcdepth_core.images.decoding import Picture
     from cvcdepth_core.networks import DepthNet
+    from cvcdepth_core.networks.checkpoint import DepthModelSpec
 
 CAMERAS = 6
 BASELINE = ("torch eager batch", "resnet18", 384, 640)
@@ -141,7 +141,7 @@ def work(connection: Connection, case: Case, device: str, threads: int) -> None:
     """Answer what `Worker.ask` asks."""
     import torch
 
-    from cvcdepth_ros.process_setup import prepare_process
+    from cvcdepth_ros.live.process_setup import prepare_process
 
     torch.set_num_threads(threads)
     if case[0] != BASELINE[0]:
@@ -158,9 +158,9 @@ def work(connection: Connection, case: Case, device: str, threads: int) -> None:
 
 def estimate_of(case: Case, device: str) -> Callable[[], Depth]:
     """Return what is measured; pictures and weights are the same for every engine of a network."""
-    from cvcdepth_core.checkpoint import DepthModelSpec
     from cvcdepth_core.engines.parity import street_like_picture
     from cvcdepth_core.estimator import DepthEstimator, untrained_network
+    from cvcdepth_core.networks.checkpoint import DepthModelSpec
 
     engine, encoder, height, width = case
     spec = DepthModelSpec(encoder=encoder, height=height, width=width, min_depth=0.5, max_depth=100.0)
@@ -180,8 +180,8 @@ def straightforward(
     """Return the pipeline that anyone would write first: one batch through the network."""
     import torch
 
+    from cvcdepth_core.images.rectifier import to_tensor
     from cvcdepth_core.networks import disparity_to_depth
-    from cvcdepth_core.preprocess import to_tensor
 
     network.eval().to(device)
     focal_lengths = torch.as_tensor(fx, dtype=torch.float32, device=device)

@@ -21,13 +21,13 @@ import torch
 from measuring import json_lines, measure_in_turns, print_line
 from torch.utils.data import DataLoader, Dataset
 
-from cvcdepth_core.checkpoint import DepthModelSpec
-from cvcdepth_core.images import Reduction, decode_compressed
-from cvcdepth_core.training_config import OptimizerConfig, RecordingsConfig, TrainingConfig
+from cvcdepth_core.images.decoding import Reduction, decode_compressed
+from cvcdepth_core.networks.checkpoint import DepthModelSpec
+from cvcdepth_core.training.config import OptimizerConfig, RecordingsConfig, TrainingConfig
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.settings import MatchingSettings
-from cvcdepth_ros.training_index import RecordingIndex, load_index
-from cvcdepth_ros.training_samples import RecordingBatches, SampleReader
+from cvcdepth_ros.training_data.index import RecordingIndex, load_index
+from cvcdepth_ros.training_data.samples import RecordingBatches, SampleReader
 
 SAMPLE = Path(__file__).parent.parent / "samples" / "pandaset_002_excerpt"
 

@@ -18,14 +18,14 @@ import cv2
 import numpy as np
 from measuring import json_lines, measure_in_turns, print_line
 
-from cvcdepth_core.images import Picture
-from cvcdepth_core.preprocess import Rectifier, SurroundPreprocessor, to_tensor
-from cvcdepth_core.rig import Camera, Rig
+from cvcdepth_core.images.decoding import Picture
+from cvcdepth_core.images.rectifier import Rectifier, SurroundPreprocessor, to_tensor
+from cvcdepth_core.rig.rig import Camera, Rig
 from cvcdepth_ros.bags import open_recording
-from cvcdepth_ros.latencies import StageLatencies
-from cvcdepth_ros.messages import picture_from_message
-from cvcdepth_ros.recorded_rig import discover_rig
-from cvcdepth_ros.set_estimation import picture_or_error
+from cvcdepth_ros.messages.conversion import picture_from_message
+from cvcdepth_ros.recordings.rig import discover_rig
+from cvcdepth_ros.surround_sets.latencies import StageLatencies
+from cvcdepth_ros.surround_sets.set_estimation import picture_or_error
 
 SAMPLE = Path(__file__).parent.parent / "samples" / "pandaset_002_excerpt"
 

@@ -33,14 +33,14 @@ from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 
 from cvcdepth_core.estimator import DepthPredictor
-from cvcdepth_core.poses import Pose, inverse, pose_from_quaternion
-from cvcdepth_core.rig import Camera, Rig
+from cvcdepth_core.rig.poses import Pose, inverse, pose_from_quaternion
+from cvcdepth_core.rig.rig import Camera, Rig
 from cvcdepth_ros.bags import RecordedMessage, Recording, RecordingWriter, open_recording
 from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings
-from cvcdepth_ros.evaluation.recording import open_evaluation
-from cvcdepth_ros.lidar import points_from_message
-from cvcdepth_ros.messages import stamp_ns
-from cvcdepth_ros.recorded_rig import assemble_rig, discover_rig
+from cvcdepth_ros.evaluation.measuring import open_evaluation
+from cvcdepth_ros.messages.conversion import stamp_ns
+from cvcdepth_ros.recordings.lidar import points_from_message
+from cvcdepth_ros.recordings.rig import assemble_rig, discover_rig
 
 SAMPLE = Path(__file__).parent.parent / "samples" / "pandaset_002_excerpt"
 STEP_NS = 1_000_000_000  # the sample is ten sets, 10 Hz

@@ -10,7 +10,7 @@ import random
 
 from measuring import json_lines, measure_in_turns, print_line
 
-from cvcdepth_ros.synchronizer import NANOSECONDS, SurroundSynchronizer
+from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS, SurroundSynchronizer
 
 CAMERAS = [f"camera{i}" for i in range(8)]
 RATE = 60  # Hz

@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cvcdepth_core.networks import DepthNet, PoseNet
-from cvcdepth_core.objective import ObjectiveConfig, Prediction, evaluate_objective
-from cvcdepth_core.rig_batch import RigBatch
-from cvcdepth_core.surround_model import SurroundModel
+from cvcdepth_core.training.batch import RigBatch
+from cvcdepth_core.training.model import SurroundModel
+from cvcdepth_core.training.objective import ObjectiveConfig, Prediction, evaluate_objective
 
 Result = TypeVar("Result")
 Seconds = NDArray[np.float64]

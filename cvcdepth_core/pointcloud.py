@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvcdepth_core.estimator import SurroundDepth
-from cvcdepth_core.rig import Rig
+from cvcdepth_core.rig.rig import Rig
 
 Cloud = NDArray[np.float32]
 

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvcdepth_core.errors import ConfigError
-from cvcdepth_core.images import Picture
-from cvcdepth_core.rig import Camera, Rig, order_around_vehicle
+from cvcdepth_core.images.decoding import Picture
+from cvcdepth_core.rig.rig import Camera, Rig, order_around_vehicle
 
 Colour = tuple[int, int, int]
 Points = NDArray[np.floating]

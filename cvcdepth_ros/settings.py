@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
-from cvcdepth_core.calibration import first_validation_message
-from cvcdepth_core.default_model import DEFAULT, NOTICE, checkpoint_path
 from cvcdepth_core.errors import ConfigError
+from cvcdepth_core.model_choices import DEFAULT, NOTICE, checkpoint_path
+from cvcdepth_core.rig.calibration import first_validation_message
 
 if TYPE_CHECKING:
     from cvcdepth_core.estimator import DepthEstimator
@@ -65,8 +65,8 @@ class ModelSettings(Settings):
 
     def build_estimator(self) -> "DepthEstimator":
         """Load the checkpoint, or make the untrained network; CheckpointError or ConfigError says what is wrong."""
-        from cvcdepth_core.checkpoint import DepthModelSpec, check_sha256
         from cvcdepth_core.estimator import DepthEstimator
+        from cvcdepth_core.networks.checkpoint import DepthModelSpec, check_sha256
 
         engine = self.model_dump(include={"backend", "precision", "cpu_fallback"})
         path = self.checkpoint_path

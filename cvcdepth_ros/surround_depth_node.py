@@ -18,21 +18,21 @@ from rclpy.utilities import remove_ros_args
 
 from cvcdepth_core.errors import CvcDepthError
 from cvcdepth_core.estimator import DepthEstimator
-from cvcdepth_core.rig import RigLayout, load_rig_layout
-from cvcdepth_ros.camera_states import CameraCondition, CameraState
-from cvcdepth_ros.diagnostics import ERROR, OK, WARN, status
-from cvcdepth_ros.live_rig import LiveRigDiscovery
-from cvcdepth_ros.managed_node import ManagedNode
-from cvcdepth_ros.node_parameters import (
+from cvcdepth_core.rig.rig import RigLayout, load_rig_layout
+from cvcdepth_ros.live.camera_states import CameraCondition, CameraState
+from cvcdepth_ros.live.process_setup import prepare_process, return_memory
+from cvcdepth_ros.messages.rig_assembly import RigAssembler
+from cvcdepth_ros.node.diagnostics import ERROR, OK, WARN, status
+from cvcdepth_ros.node.live_rig import LiveRigDiscovery
+from cvcdepth_ros.node.managed_node import ManagedNode
+from cvcdepth_ros.node.parameters import (
     AUTO,
     CHANGEABLE_WHILE_RUNNING,
     NodeParameters,
     declare_parameters,
     read_parameters,
 )
-from cvcdepth_ros.process_setup import prepare_process, return_memory
-from cvcdepth_ros.rig_assembly import RigAssembler
-from cvcdepth_ros.surround_session import SurroundSession
+from cvcdepth_ros.node.session import SurroundSession
 
 _POLL_SECONDS = 0.25
 _DIAGNOSTICS_SECONDS = 1.0

@@ -3,7 +3,7 @@
 
 from xml.etree import ElementTree
 
-from cvcdepth_ros.share import share_directory
+from cvcdepth_ros.installation import share_directory
 
 
 def package_version() -> str:

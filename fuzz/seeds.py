@@ -21,7 +21,7 @@ from rosbags.typesys import Stores, get_typestore
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
 
-from cvcdepth_ros.messages import bag_message_factory  # noqa: E402
+from cvcdepth_ros.messages.conversion import bag_message_factory  # noqa: E402
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
 NOETIC = get_typestore(Stores.ROS1_NOETIC)

@@ -2,7 +2,7 @@
 """What is fuzzed: each target takes any bytes and may raise nothing.
 
 A target does what the product does with bytes that strangers made, and lets through only the family of errors that
-programs print as one line. `fuzz/run.py` drives the targets with atheris, `tests/test_fuzz_corpus.py` replays the
+programs print as one line. `fuzz/run.py` drives the targets with atheris, `tests/whole/test_fuzz_corpus.py` replays the
 corpus without it.
 """
 
@@ -16,15 +16,15 @@ from types import SimpleNamespace
 from typing import Any
 
 from cvcdepth_core.errors import CvcDepthError
-from cvcdepth_core.images import Reduction, decode_compressed, decode_raw
-from cvcdepth_core.preprocess import Rectifier
-from cvcdepth_core.rig import load_rig_layout
+from cvcdepth_core.images.decoding import Reduction, decode_compressed, decode_raw
+from cvcdepth_core.images.rectifier import Rectifier
+from cvcdepth_core.rig.rig import load_rig_layout
 from cvcdepth_ros.bags import Recording, open_recording, typestore
-from cvcdepth_ros.lidar import points_from_message
-from cvcdepth_ros.messages import calibration_from_message, picture_from_message, stamp_ns
-from cvcdepth_ros.recorded_rig import discover_rig
-from cvcdepth_ros.recording_summary import summarize
-from cvcdepth_ros.transforms import TransformTree
+from cvcdepth_ros.messages.conversion import calibration_from_message, picture_from_message, stamp_ns
+from cvcdepth_ros.messages.transforms import TransformTree
+from cvcdepth_ros.recordings.lidar import points_from_message
+from cvcdepth_ros.recordings.rig import discover_rig
+from cvcdepth_ros.recordings.summary import summarize
 
 _PIXELS = 1 << 16  # keeps one execution short, and is a bound like any other
 _REDUCTIONS: tuple[Reduction, ...] = (1, 2, 4, 8)

@@ -22,7 +22,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--golden-dir",
         type=Path,
-        default=Path(__file__).parent / "golden",
+        default=Path(__file__).parent / "whole" / "golden",
         help="where test_golden.py finds the published program's arrays",
     )
     parser.addoption("--all-faults", action="store_true", help="inject all faults into the node, not only every fifth")

@@ -22,17 +22,17 @@ from typing import Any, NamedTuple
 import cv2
 import torch
 
-from cvcdepth_core.checkpoint import load_checkpoint
-from cvcdepth_core.rig import load_rig_layout
-from cvcdepth_core.run_folder import CHECKPOINT_FILE
-from cvcdepth_core.starting_model import build_surround_model
-from cvcdepth_core.training import Trainer
-from cvcdepth_core.training_config import TrainingConfig, load_training_config
+from cvcdepth_core.networks.checkpoint import load_checkpoint
+from cvcdepth_core.rig.rig import load_rig_layout
+from cvcdepth_core.training.config import TrainingConfig, load_training_config
+from cvcdepth_core.training.run_folder import CHECKPOINT_FILE
+from cvcdepth_core.training.starting_model import build_surround_model
+from cvcdepth_core.training.trainer import Trainer
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.settings import MatchingSettings
-from cvcdepth_ros.synchronizer import NANOSECONDS
-from cvcdepth_ros.training_index import RecordingIndex, load_index
-from cvcdepth_ros.training_samples import RecordingBatches, first_held_out
+from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS
+from cvcdepth_ros.training_data.index import RecordingIndex, load_index
+from cvcdepth_ros.training_data.samples import RecordingBatches, first_held_out
 
 PUBLISHED = Path(__file__).parent.parent / "config" / "training" / "ablation"
 VARIANTS = {

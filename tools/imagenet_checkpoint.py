@@ -19,10 +19,10 @@ from pathlib import Path
 
 import torch
 
-from cvcdepth_core.checkpoint import DepthModelSpec, load_imagenet_encoder, save_checkpoint
 from cvcdepth_core.errors import ConfigError
 from cvcdepth_core.networks import DepthNet, PoseNet
-from cvcdepth_core.training_config import load_training_config
+from cvcdepth_core.networks.checkpoint import DepthModelSpec, load_imagenet_encoder, save_checkpoint
+from cvcdepth_core.training.config import load_training_config
 
 
 def main() -> None:

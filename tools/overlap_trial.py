@@ -23,12 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvcdepth_core.estimator import DepthEstimator, SurroundDepth
-from cvcdepth_core.images import Picture
-from cvcdepth_core.overlap_monitor import OverlapMonitor
-from cvcdepth_core.rig import Rig
+from cvcdepth_core.images.decoding import Picture
+from cvcdepth_core.rig.rig import Rig
+from cvcdepth_core.rig_health.overlap_monitor import OverlapMonitor
 from cvcdepth_ros.bags import open_recording
-from cvcdepth_ros.recorded_rig import discover_rig
-from cvcdepth_ros.replay import DepthReplay, SurroundReplay
+from cvcdepth_ros.recordings.replay import DepthReplay, SurroundReplay
+from cvcdepth_ros.recordings.rig import discover_rig
 from cvcdepth_ros.settings import MatchingSettings, ModelSettings
 
 PERIOD_NS = 10**8

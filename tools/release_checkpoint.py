@@ -12,7 +12,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from cvcdepth_core.checkpoint import load_checkpoint, save_checkpoint
+from cvcdepth_core.networks.checkpoint import load_checkpoint, save_checkpoint
 
 
 def main() -> None:

@@ -3,10 +3,10 @@
 
     python tools/soak.py --minutes 60 --output output/soak.json
 
-The faults are those of tests/ros/camera_faults.py: first each at all cameras at once, so that whatever is kept for it
-is kept before memory is compared, then at one or two cameras for some seconds, as `--seed` decides. The run fails when
-the node ends, when its memory grows by more than 2 % after five minutes (or after a third of a shorter run), when its
-files or threads become more, or when a depth image carries a stamp that its camera has not sent, or one twice.
+The faults are those of tests/support/camera_faults.py: first each at all cameras at once, so that whatever is kept for
+it is kept before memory is compared, then at one or two cameras for some seconds, as `--seed` decides. The run fails
+when the node ends, when its memory grows by more than 2 % after five minutes (or after a third of a shorter run), when
+its files or threads become more, or when a depth image carries a stamp that its camera has not sent, or one twice.
 """
 
 import argparse
@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).parent.parent
-sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "tests" / "ros")]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "support")]
 
 from camera_faults import FAULTS  # noqa: E402
 from camera_scene import DEPTH, Scene, running_scene, stamp_of  # noqa: E402

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from cvcdepth_core.engines.engine import DeviceMemoryError, DisparityEngine
 from cvcdepth_core.errors import EngineError
-from cvcdepth_core.images import Picture
-from cvcdepth_core.preprocess import to_tensor
+from cvcdepth_core.images.decoding import Picture
+from cvcdepth_core.images.rectifier import to_tensor
 
 
 class GuardedEngine:

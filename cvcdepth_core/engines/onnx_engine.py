@@ -14,11 +14,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from cvcdepth_core.checkpoint import DepthModelSpec
 from cvcdepth_core.engines.engine import DeviceMemoryError, Precision, best_chunk
 from cvcdepth_core.engines.rewriting import RewrittenDepthNet
 from cvcdepth_core.errors import EngineError
 from cvcdepth_core.networks import DepthNet
+from cvcdepth_core.networks.checkpoint import DepthModelSpec
 
 INPUT, OUTPUT = "images", "disparity"
 MOST_CAMERAS = 12

@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import torch
 
-from cvcdepth_core.checkpoint import DepthModelSpec
 from cvcdepth_core.engines.engine import DisparityEngine, Precision
 from cvcdepth_core.errors import EngineError
-from cvcdepth_core.images import Picture
+from cvcdepth_core.images.decoding import Picture
+from cvcdepth_core.images.rectifier import to_tensor
 from cvcdepth_core.networks import DepthNet, disparity_to_depth
-from cvcdepth_core.preprocess import to_tensor
+from cvcdepth_core.networks.checkpoint import DepthModelSpec
 
 QUANTILE = 0.999
 LARGEST_RELATIVE_ERRORS: dict[Precision, float] = {"float32": 1e-3, "float16": 1e-2, "bfloat16": 5e-2}

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from cvcdepth_core.estimator import SurroundDepth
 from cvcdepth_core.pointcloud import CloudLimits
-from cvcdepth_core.rig import Rig
+from cvcdepth_core.rig.rig import Rig
 
 
 def straightforward_cloud(surround: SurroundDepth, rig: Rig, limits: CloudLimits) -> NDArray[np.float32]:

@@ -20,18 +20,18 @@ from rclpy.node import Node
 
 from cvcdepth_core.errors import CvcDepthError
 from cvcdepth_core.estimator import SurroundDepthEstimator
-from cvcdepth_core.rig import load_rig_layout
+from cvcdepth_core.rig.rig import load_rig_layout
 from cvcdepth_ros.bench.straightforward import straightforward_cloud
-from cvcdepth_ros.diagnostics import SynchronisationStatus, inference_status
-from cvcdepth_ros.inputs import CameraInputs
-from cvcdepth_ros.latencies import StageLatencies
-from cvcdepth_ros.mailbox import MailboxStatistics
-from cvcdepth_ros.messages import ros_message_class, ros_message_factory, stamp_ns
-from cvcdepth_ros.node_parameters import declare_parameters, read_parameters
-from cvcdepth_ros.process_setup import prepare_process
-from cvcdepth_ros.set_estimation import estimate_set
-from cvcdepth_ros.surround_messages import MERGED_CLOUD, SurroundMessages, output_types
-from cvcdepth_ros.synchronizer import SurroundSet, SurroundSynchronizer
+from cvcdepth_ros.live.mailbox import MailboxStatistics
+from cvcdepth_ros.live.process_setup import prepare_process
+from cvcdepth_ros.messages.conversion import ros_message_class, ros_message_factory, stamp_ns
+from cvcdepth_ros.node.diagnostics import SynchronisationStatus, inference_status
+from cvcdepth_ros.node.parameters import declare_parameters, read_parameters
+from cvcdepth_ros.node.subscriptions import CameraInputs
+from cvcdepth_ros.surround_sets.latencies import StageLatencies
+from cvcdepth_ros.surround_sets.output_messages import MERGED_CLOUD, SurroundMessages, output_types
+from cvcdepth_ros.surround_sets.set_estimation import estimate_set
+from cvcdepth_ros.surround_sets.synchronizer import SurroundSet, SurroundSynchronizer
 
 
 class StraightforwardNode(Node):  # type: ignore[misc] # rclpy is not annotated

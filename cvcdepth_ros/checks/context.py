@@ -13,15 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvcdepth_core.errors import ImageError, RecordingError, RigError, TransformError
-from cvcdepth_core.images import Picture
-from cvcdepth_core.rig import Rig, RigLayout
+from cvcdepth_core.images.decoding import Picture
+from cvcdepth_core.rig.rig import Rig, RigLayout
 from cvcdepth_ros.bags import RecordedMessage, Recording
-from cvcdepth_ros.lidar import VehicleMotion, find_lidars
-from cvcdepth_ros.messages import picture_from_message
-from cvcdepth_ros.recorded_rig import IMAGE_TYPES, collect_rig, discover_layout
-from cvcdepth_ros.rig_assembly import RigAssembler
-from cvcdepth_ros.synchronizer import SurroundSet, SurroundSynchronizer
-from cvcdepth_ros.topic_timing import TopicTiming
+from cvcdepth_ros.messages.conversion import picture_from_message
+from cvcdepth_ros.messages.rig_assembly import RigAssembler
+from cvcdepth_ros.recordings.lidar import VehicleMotion, find_lidars
+from cvcdepth_ros.recordings.rig import IMAGE_TYPES, collect_rig, discover_layout
+from cvcdepth_ros.recordings.topic_timing import TopicTiming
+from cvcdepth_ros.surround_sets.synchronizer import SurroundSet, SurroundSynchronizer
 
 Status = Literal["passed", "warning", "failed", "skipped"]
 

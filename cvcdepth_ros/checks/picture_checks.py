@@ -6,11 +6,11 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from cvcdepth_core.camera_places import Exchange, PlacedPictures, best_exchange
 from cvcdepth_core.errors import ImageError, RigError
-from cvcdepth_core.images import Picture
-from cvcdepth_core.preprocess import SurroundPreprocessor
-from cvcdepth_core.rig import Rig
+from cvcdepth_core.images.decoding import Picture
+from cvcdepth_core.images.rectifier import SurroundPreprocessor
+from cvcdepth_core.rig.rig import Rig
+from cvcdepth_core.rig_health.swapped_cameras import Exchange, PlacedPictures, best_exchange
 from cvcdepth_ros.checks.context import CheckContext, CheckResult, Status
 
 _THUMBNAIL = (96, 54)

@@ -7,8 +7,9 @@ from collections.abc import Iterator, Mapping
 
 from cvcdepth_ros.bags import Recording
 from cvcdepth_ros.checks.context import CheckContext, CheckResult
-from cvcdepth_ros.fixed_frames import MOVING_TRANSFORMS
-from cvcdepth_ros.recorded_rig import (
+from cvcdepth_ros.messages.transforms import frame_name
+from cvcdepth_ros.recordings.fixed_frames import MOVING_TRANSFORMS
+from cvcdepth_ros.recordings.rig import (
     IMAGE_TYPES,
     STATIC_TRANSFORMS,
     is_of_depth,
@@ -16,7 +17,6 @@ from cvcdepth_ros.recorded_rig import (
     topic_problems,
     topics_without_images,
 )
-from cvcdepth_ros.transforms import frame_name
 
 _INFO = "camera_info"
 _TOLD = 2

@@ -15,9 +15,9 @@ from cvcdepth_ros.settings import ModelSettings
 from cvcdepth_ros.version import package_version
 
 if TYPE_CHECKING:
-    from cvcdepth_core.rig import RigLayout
-    from cvcdepth_ros.demo.live_run import LiveOutcome
-    from cvcdepth_ros.demo.paths import DemoPaths
+    from cvcdepth_core.rig.rig import RigLayout
+    from cvcdepth_ros.end_to_end.live_run import LiveOutcome
+    from cvcdepth_ros.end_to_end.paths import DemoPaths
 
 SUMMARY = """Measure the live node on a recording, over DDS, against the straightforward node.
 
@@ -46,8 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def execute(arguments: argparse.Namespace) -> None:
     """Measure and print."""
     from cvcdepth_ros.bags import open_recording
-    from cvcdepth_ros.bench.repeated_recording import write_repeated
-    from cvcdepth_ros.recorded_rig import discover_rig
+    from cvcdepth_ros.end_to_end.repeated_recording import write_repeated
+    from cvcdepth_ros.recordings.rig import discover_rig
 
     model = settings_from(arguments, ModelSettings)
     with tempfile.TemporaryDirectory(prefix="cvcdepth_bench_") as folder, open_recording(arguments.recording) as source:
@@ -63,11 +63,11 @@ def _measure(
     folder: Path, name: str, played: Path, layout: "RigLayout", model: ModelSettings, arguments: argparse.Namespace
 ) -> dict[str, Any]:
     """Run one of the nodes."""
-    from cvcdepth_core.rig import save_rig_layout
-    from cvcdepth_ros.demo.live_run import LiveRun
-    from cvcdepth_ros.demo.paths import DemoPaths
-    from cvcdepth_ros.demo.processes import children
-    from cvcdepth_ros.demo.received import node_outputs
+    from cvcdepth_core.rig.rig import save_rig_layout
+    from cvcdepth_ros.end_to_end.live_run import LiveRun
+    from cvcdepth_ros.end_to_end.paths import DemoPaths
+    from cvcdepth_ros.end_to_end.processes import children
+    from cvcdepth_ros.end_to_end.received import node_outputs
 
     paths = DemoPaths(folder / name)
     paths.prepare()
@@ -98,7 +98,7 @@ def _figures(paths: "DemoPaths", anchor: str, info: str, outcome: "LiveOutcome")
     """
     import numpy as np
 
-    from cvcdepth_ros.surround_messages import DEPTH
+    from cvcdepth_ros.surround_sets.output_messages import DEPTH
 
     sent = _arrivals(paths.recording, info)
     depth = _arrivals(paths.recording, f"{_NODE}/{anchor}/{DEPTH}")
@@ -129,7 +129,7 @@ def _figures(paths: "DemoPaths", anchor: str, info: str, outcome: "LiveOutcome")
 def _arrivals(path: Path, topic: str) -> dict[int, int]:
     """Return when (ns) each of the topic's messages came, by its stamp."""
     from cvcdepth_ros.bags import open_recording
-    from cvcdepth_ros.messages import stamp_ns
+    from cvcdepth_ros.messages.conversion import stamp_ns
 
     with open_recording(path) as recording:
         return {stamp_ns(recording.deserialize(m)): m.log_time for m in recording.messages([topic])}

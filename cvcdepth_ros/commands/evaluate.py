@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cvcdepth_core.atomic_file import write_atomically, write_json
+from cvcdepth_core.files import write_atomically, write_json
 from cvcdepth_ros.commands.arguments import (
     add_json,
     add_lidar,
@@ -27,8 +27,8 @@ from cvcdepth_ros.commands.arguments import (
 from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings, unique_names
 
 if TYPE_CHECKING:
-    from cvcdepth_core.scores import Score
-    from cvcdepth_ros.evaluation.recording import Progress, RecordingScores
+    from cvcdepth_core.scoring.scores import Score
+    from cvcdepth_ros.evaluation.measuring import Progress, RecordingScores
     from cvcdepth_ros.evaluation.result import EvaluationResult
     from cvcdepth_ros.evaluation.workers import Pool
 
@@ -128,7 +128,7 @@ def _evaluated(
     arguments: argparse.Namespace, settings: EvaluationSettings, folder: Path
 ) -> "tuple[Path, dict[str, Any], str]":
     """Write one model's results; return their folder and what to print."""
-    from cvcdepth_ros.evaluation.frames import write_csv
+    from cvcdepth_ros.evaluation.image_scores import write_csv
 
     if settings.notice:
         warn(settings.notice)
@@ -140,7 +140,7 @@ def _evaluated(
     write_atomically(folder / _METRICS_FILE, f"{json.dumps(content)}\n".encode())
     write_csv(folder / _FRAMES_FILE, result.images)
     if with_report:
-        from cvcdepth_ros.evaluation.report.page import write_report
+        from cvcdepth_ros.reports.evaluation_page import write_report
 
         write_report(folder / _REPORT_FILE, result, {job.name: job for job in jobs})
     return folder, {name: value for name, value in content.items() if name != "rows"}, _text(result, folder)
@@ -179,7 +179,7 @@ def _pool(arguments: argparse.Namespace, settings: EvaluationSettings) -> "Abstr
 
 
 def _jobs(arguments: argparse.Namespace, settings: EvaluationSettings) -> list[EvaluationJob]:
-    from cvcdepth_core.rig import load_rig_layout
+    from cvcdepth_core.rig.rig import load_rig_layout
     from cvcdepth_ros.bags import find_recordings
 
     locations = find_recordings(arguments.recordings)
@@ -201,7 +201,7 @@ def _comparison(first: Path, second: Path) -> tuple[dict[str, Any], str]:
 
 
 def _warn_of_losses(job: EvaluationJob, scores: "RecordingScores") -> None:
-    from cvcdepth_ros.lidar import told_of_cameras
+    from cvcdepth_ros.recordings.lidar import told_of_cameras
 
     damage, sets = scores.summary["damage"], scores.summary["sets"]["scored"]
     if damage:
@@ -230,7 +230,7 @@ def _progress(recordings: int, quiet: bool) -> "Iterator[Progress]":
 
 
 def _text(result: "EvaluationResult", folder: Path) -> str:
-    from cvcdepth_core.scores import ALL
+    from cvcdepth_core.scoring.scores import ALL
 
     summary, scaled = result.summary(), result.summary(scaling="median")
     header = ("", "abs_rel", "median-scaled", "scale", "rmse", "delta_1", "coverage", "truth points")

@@ -10,7 +10,7 @@ from cvcdepth_ros.commands.arguments import add_json, print_result, refuse_to_ov
 from cvcdepth_ros.version import package_version
 
 if TYPE_CHECKING:
-    from cvcdepth_core.checkpoint import Checkpoint
+    from cvcdepth_core.networks.checkpoint import Checkpoint
 
 SUMMARY = """Write the depth network as ONNX, or build its TensorRT engine.
 
@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(arguments: argparse.Namespace) -> None:
     """Export, and tell what was written."""
-    from cvcdepth_core.checkpoint import load_checkpoint
+    from cvcdepth_core.networks.checkpoint import load_checkpoint
 
     unused = ("output", "force") if arguments.tensorrt else ("precision", "device")
     if given := [name for name in unused if getattr(arguments, name)]:
@@ -56,8 +56,8 @@ def execute(arguments: argparse.Namespace) -> None:
 
 
 def _write_onnx(checkpoint: "Checkpoint", output: Path | None, force: bool) -> tuple[Path, float]:
-    from cvcdepth_core.atomic_file import write_atomically, write_json
     from cvcdepth_core.engines import export_onnx
+    from cvcdepth_core.files import write_atomically, write_json
 
     path = output or checkpoint.path.with_suffix(".onnx")
     beside = path.with_suffix(".json")

@@ -5,8 +5,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cvcdepth_core.atomic_file import write_json
 from cvcdepth_core.errors import ConfigError, NotPromotedError
+from cvcdepth_core.files import write_json
 from cvcdepth_ros.commands.arguments import (
     add_json,
     add_lidar,
@@ -22,7 +22,7 @@ from cvcdepth_ros.commands.arguments import (
 )
 
 if TYPE_CHECKING:
-    from cvcdepth_core.distributed import Processes
+    from cvcdepth_core.training.distributed import Processes
     from cvcdepth_ros.finetuning.run import FineTuned, Order
 
 SUMMARY = """Train depth from recordings, without labels, and prove that it got better.
@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(arguments: argparse.Namespace) -> None:
     """Train and judge, with the other processes that torchrun started; CvcDepthError says why not."""
-    from cvcdepth_core.distributed import launched_processes
+    from cvcdepth_core.training.distributed import launched_processes
     from cvcdepth_ros.finetuning.run import BEST_FILE
 
     refuse_unknown_checks(arguments)
@@ -79,8 +79,8 @@ def execute(arguments: argparse.Namespace) -> None:
 
 
 def _fine_tuned(arguments: argparse.Namespace, processes: "Processes") -> "FineTuned | None":
-    from cvcdepth_ros.finetuning.monitoring import WITHOUT_TENSORBOARD, has_tensorboard
     from cvcdepth_ros.finetuning.run import fine_tune
+    from cvcdepth_ros.finetuning.tensorboard import WITHOUT_TENSORBOARD, has_tensorboard
 
     order = _order(arguments)
     if processes.is_first and not has_tensorboard():
@@ -93,10 +93,10 @@ def _fine_tuned(arguments: argparse.Namespace, processes: "Processes") -> "FineT
 
 
 def _order(arguments: argparse.Namespace) -> "Order":
-    from cvcdepth_core.checkpoint import load_checkpoint
-    from cvcdepth_core.default_model import checkpoint_path
-    from cvcdepth_core.rig import load_rig_layout
-    from cvcdepth_core.training_config import load_training_config
+    from cvcdepth_core.model_choices import checkpoint_path
+    from cvcdepth_core.networks.checkpoint import load_checkpoint
+    from cvcdepth_core.rig.rig import load_rig_layout
+    from cvcdepth_core.training.config import load_training_config
     from cvcdepth_ros.bags import find_recordings
     from cvcdepth_ros.finetuning.preparation import Source
     from cvcdepth_ros.finetuning.run import Order
@@ -124,7 +124,7 @@ def _written(tuned: "FineTuned", with_report: bool) -> dict[str, Any]:
     run, card = tuned.order.run, model_card(tuned)
     write_card(run, card)
     if with_report:
-        from cvcdepth_ros.finetuning.page import write_report
+        from cvcdepth_ros.reports.finetuning_page import write_report
 
         write_report(run / _REPORT_FILE, tuned, card)
     shown = ("started_from", "version", "promoted", "verdict", "scores", "left_out", "warnings", "configuration")

@@ -22,7 +22,7 @@ from cvcdepth_ros.commands.arguments import (
 
 if TYPE_CHECKING:
     from cvcdepth_ros.bags import Location
-    from cvcdepth_ros.recording_summary import CameraSummary, IndexState, RecordingSummary, TopicSummary
+    from cvcdepth_ros.recordings.summary import CameraSummary, IndexState, RecordingSummary, TopicSummary
 
 SUMMARY = """Tell what is in recordings: topics, rates, gaps, clocks, cameras, damage.
 
@@ -67,7 +67,7 @@ def execute(arguments: argparse.Namespace) -> None:
 
 def _summary(location: "Location", arguments: argparse.Namespace) -> "RecordingSummary":
     from cvcdepth_ros.bags import open_recording
-    from cvcdepth_ros.recording_summary import summarize
+    from cvcdepth_ros.recordings.summary import summarize
 
     with open_recording(location) as recording:
         window = window_ns(arguments, recording.start)

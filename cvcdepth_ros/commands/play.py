@@ -21,7 +21,7 @@ from cvcdepth_ros.commands.arguments import (
 
 if TYPE_CHECKING:
     from cvcdepth_ros.bags import Recording
-    from cvcdepth_ros.player import RecordingPlayer
+    from cvcdepth_ros.node.player import RecordingPlayer
 
 SUMMARY = """Publish a recording on its own topics in real time, with the QoS it was recorded with.
 
@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def execute(arguments: argparse.Namespace) -> None:
     """Play until the end or until interrupted."""
     from cvcdepth_ros.bags import open_recording
-    from cvcdepth_ros.process_setup import prepare_process
+    from cvcdepth_ros.live.process_setup import prepare_process
 
     prepare_process()
     rclpy = _import_rclpy()
@@ -75,7 +75,7 @@ def execute(arguments: argparse.Namespace) -> None:
 
 
 def _play(recording: "Recording", arguments: argparse.Namespace) -> dict[str, Any]:
-    from cvcdepth_ros.player import RecordingPlayer
+    from cvcdepth_ros.node.player import RecordingPlayer
 
     interrupted = False
     with RecordingPlayer(recording, arguments.topics, arguments.clock) as player:

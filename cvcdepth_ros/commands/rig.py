@@ -11,7 +11,7 @@ from cvcdepth_ros.commands.arguments import add_json, add_recording, print_resul
 from cvcdepth_ros.version import package_version
 
 if TYPE_CHECKING:
-    from cvcdepth_core.rig import Camera, Rig, RigLayout
+    from cvcdepth_core.rig.rig import Camera, Rig, RigLayout
     from cvcdepth_ros.bags import Location
 
 SUMMARY = """Write a rig file from a recording.
@@ -41,9 +41,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(arguments: argparse.Namespace) -> None:
     """Write the rig file and show what is in it."""
-    from cvcdepth_core.rig import save_rig_layout
+    from cvcdepth_core.rig.rig import save_rig_layout
     from cvcdepth_ros.bags import open_recording
-    from cvcdepth_ros.recorded_rig import discover_rig
+    from cvcdepth_ros.recordings.rig import discover_rig
 
     if not arguments.force:
         refuse_to_overwrite(arguments.output)
@@ -64,9 +64,9 @@ def execute(arguments: argparse.Namespace) -> None:
 
 
 def _with_found_masks(layout: "RigLayout", recording: "Location", folder: Path) -> "RigLayout":
-    from cvcdepth_ros.self_occlusion import find_self_occlusion, save_masks
     from cvcdepth_ros.settings import MatchingSettings
-    from cvcdepth_ros.training_index import build_index
+    from cvcdepth_ros.training_data.index import build_index
+    from cvcdepth_ros.training_data.own_body_masks import find_self_occlusion, save_masks
 
     masks = find_self_occlusion(build_index(recording, MatchingSettings(), layout))
     return save_masks(layout, masks, folder)

@@ -12,8 +12,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from cvcdepth_core.atomic_file import write_json
 from cvcdepth_core.errors import RecordingError
+from cvcdepth_core.files import write_json
 from cvcdepth_ros.commands.arguments import (
     add_json,
     add_recording,
@@ -29,10 +29,10 @@ from cvcdepth_ros.settings import MatchingSettings, MissingCameraSettings, Model
 from cvcdepth_ros.version import package_version
 
 if TYPE_CHECKING:
-    from cvcdepth_core.rig import RigLayout
+    from cvcdepth_core.rig.rig import RigLayout
     from cvcdepth_ros.bags import Recording
-    from cvcdepth_ros.latencies import StageLatencies
-    from cvcdepth_ros.replay import DepthReplay, EstimatedSet, SurroundReplay
+    from cvcdepth_ros.recordings.replay import DepthReplay, EstimatedSet, SurroundReplay
+    from cvcdepth_ros.surround_sets.latencies import StageLatencies
 
 SUMMARY = """Compute depth and clouds into a new recording that Foxglove and RViz open.
 
@@ -80,7 +80,7 @@ def execute(arguments: argparse.Namespace) -> None:
     if settings.notice:
         warn(settings.notice)
     with open_recording(arguments.recording) as recording:
-        from cvcdepth_ros.replay import DepthReplay, SurroundReplay  # torch: not before there is a recording
+        from cvcdepth_ros.recordings.replay import DepthReplay, SurroundReplay  # torch: not before there is a recording
 
         replay = SurroundReplay(recording, _layout(arguments, recording), settings, settings.min_cameras)
         with _trace(arguments.trace) as latencies:
@@ -104,8 +104,8 @@ def execute(arguments: argparse.Namespace) -> None:
 @contextmanager
 def _trace(path: Path | None) -> "Iterator[StageLatencies]":
     """Give stage latencies that write a trace, where a file for it is named."""
-    from cvcdepth_ros.latencies import StageLatencies
-    from cvcdepth_ros.trace_file import TraceFile
+    from cvcdepth_ros.surround_sets.latencies import StageLatencies
+    from cvcdepth_ros.surround_sets.trace_file import TraceFile
 
     trace = TraceFile(path) if path else None
     try:
@@ -116,8 +116,8 @@ def _trace(path: Path | None) -> "Iterator[StageLatencies]":
 
 
 def _layout(arguments: argparse.Namespace, recording: "Recording") -> "RigLayout":
-    from cvcdepth_core.rig import load_rig_layout
-    from cvcdepth_ros.recorded_rig import discover_rig
+    from cvcdepth_core.rig.rig import load_rig_layout
+    from cvcdepth_ros.recordings.rig import discover_rig
 
     return load_rig_layout(arguments.rig) if arguments.rig else discover_rig(recording, arguments.base_frame)
 
@@ -126,7 +126,7 @@ def _record(
     arguments: argparse.Namespace, settings: RunSettings, replay: "SurroundReplay", depths: "DepthReplay"
 ) -> dict[str, Any]:
     """Compute and write all sets; without any, nothing is left behind and RecordingError says why."""
-    from cvcdepth_ros.depth_recording import DepthRecorder
+    from cvcdepth_ros.recordings.depth_recorder import DepthRecorder
 
     window = window_ns(arguments, replay.recording.start)
     began = time.monotonic()

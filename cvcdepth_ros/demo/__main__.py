@@ -16,19 +16,19 @@ import yaml
 from pydantic import ValidationError
 from tqdm import tqdm
 
-from cvcdepth_core.calibration import first_validation_message
 from cvcdepth_core.errors import ConfigError, CvcDepthError
-from cvcdepth_core.rig import RigLayout, load_rig_layout
+from cvcdepth_core.rig.calibration import first_validation_message
+from cvcdepth_core.rig.rig import RigLayout, load_rig_layout
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.commands.arguments import positive
-from cvcdepth_ros.demo.live_run import LiveOutcome, LiveRun
 from cvcdepth_ros.demo.pace import manageable_rate
-from cvcdepth_ros.demo.paths import DemoPaths
-from cvcdepth_ros.demo.processes import children
-from cvcdepth_ros.demo.received import Output, ReceivedSets, node_outputs, sent_sets
 from cvcdepth_ros.demo.recorded_lidar import RecordedLidar
 from cvcdepth_ros.demo.result import DemoResult
 from cvcdepth_ros.demo.sheets import SheetWriter
+from cvcdepth_ros.end_to_end.live_run import LiveOutcome, LiveRun
+from cvcdepth_ros.end_to_end.paths import DemoPaths
+from cvcdepth_ros.end_to_end.processes import children
+from cvcdepth_ros.end_to_end.received import Output, ReceivedSets, node_outputs, sent_sets
 from cvcdepth_ros.settings import ModelSettings
 from cvcdepth_ros.version import package_version
 

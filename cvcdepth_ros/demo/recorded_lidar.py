@@ -2,11 +2,11 @@
 """The LiDAR of a recording, at the moments of its surround sets."""
 
 from cvcdepth_core.errors import TransformError
-from cvcdepth_core.rig import RigLayout
+from cvcdepth_core.rig.rig import RigLayout
 from cvcdepth_core.visualization import Points
 from cvcdepth_ros.bags import RecordedMessage, Recording
-from cvcdepth_ros.lidar import LidarSweeps, VehicleMotion, find_lidars
-from cvcdepth_ros.recorded_rig import assemble_rig
+from cvcdepth_ros.recordings.lidar import LidarSweeps, VehicleMotion, find_lidars
+from cvcdepth_ros.recordings.rig import assemble_rig
 
 _AHEAD_NS = 300_000_000  # a sweep is recorded after its stamp, and may be later than the set
 

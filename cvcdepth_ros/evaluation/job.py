@@ -16,9 +16,9 @@ from cvcdepth_ros.version import package_version
 
 if TYPE_CHECKING:
     from cvcdepth_core.estimator import DepthPredictor
-    from cvcdepth_core.ground_truth import OcclusionFilter
-    from cvcdepth_core.rig import Rig, RigLayout
-    from cvcdepth_core.scores import ScoreSettings
+    from cvcdepth_core.rig.rig import Rig, RigLayout
+    from cvcdepth_core.scoring.ground_truth import OcclusionFilter
+    from cvcdepth_core.scoring.scores import ScoreSettings
 
 
 class Dependencies(NamedTuple):
@@ -59,14 +59,14 @@ class EvaluationSettings(MatchingSettings, ModelSettings):
     @property
     def scores(self) -> ScoreSettings:
         """What is measured."""
-        from cvcdepth_core.scores import ScoreSettings
+        from cvcdepth_core.scoring.scores import ScoreSettings
 
         return ScoreSettings(min_depth=self.min_depth, max_depth=self.max_depth)
 
     @property
     def occlusion(self) -> OcclusionFilter | None:
         """Which LiDAR points are no truth."""
-        from cvcdepth_core.ground_truth import OcclusionFilter
+        from cvcdepth_core.scoring.ground_truth import OcclusionFilter
 
         return None if self.no_occlusion_filter else OcclusionFilter()
 
@@ -82,14 +82,14 @@ class EvaluationSettings(MatchingSettings, ModelSettings):
 
     def dependencies(self) -> Dependencies:
         """Look at what this machine has; CheckpointError says what is wrong with the checkpoint."""
-        from cvcdepth_core.checkpoint import load_checkpoint
+        from cvcdepth_core.networks.checkpoint import load_checkpoint
 
         path = self.checkpoint_path
         return Dependencies(package_version(), load_checkpoint(path).sha256 if path else None)
 
     def build_predictor(self, rig: Rig) -> DepthPredictor:
         """Load the network, or make the reference for this rig; the errors of the family say what is wrong."""
-        from cvcdepth_core.reference_predictors import constant_depth, ground_plane_depth
+        from cvcdepth_core.scoring.references import constant_depth, ground_plane_depth
 
         if self.predictor == "constant":
             return constant_depth(rig, self.constant_depth, self.height, self.width)

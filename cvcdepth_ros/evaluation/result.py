@@ -12,14 +12,14 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cvcdepth_core.comparison import Comparison, compare
-from cvcdepth_core.consistency import AgreementTable, summarise_agreement
 from cvcdepth_core.errors import ConfigError, RecordingError
-from cvcdepth_core.scores import SCALINGS, Scaling, Scores, Summary
-from cvcdepth_core.scores import Protocol as ScoreProtocol
-from cvcdepth_ros.evaluation.frames import ImageScore, SetScore, correlations, image_scores
+from cvcdepth_core.scoring.comparison import Comparison, compare
+from cvcdepth_core.scoring.consistency import AgreementTable, summarise_agreement
+from cvcdepth_core.scoring.scores import SCALINGS, Scaling, Scores, Summary
+from cvcdepth_core.scoring.scores import Protocol as ScoreProtocol
+from cvcdepth_ros.evaluation.image_scores import ImageScore, SetScore, correlations, image_scores
 from cvcdepth_ros.evaluation.job import Dependencies, EvaluationJob
-from cvcdepth_ros.evaluation.recording import RecordingScores
+from cvcdepth_ros.evaluation.measuring import RecordingScores
 
 SCHEMA = 2
 _DECIDE_WHAT_IS_MEASURED = ("rig", "base_frame", "tolerance", "lidar", "lidar_tolerance", "no_occlusion_filter")

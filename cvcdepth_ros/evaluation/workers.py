@@ -18,11 +18,11 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from cvcdepth_core.atomic_file import write_atomically
 from cvcdepth_core.errors import CvcDepthError
+from cvcdepth_core.files import write_atomically
 from cvcdepth_ros.bags import file_identities
 from cvcdepth_ros.evaluation.job import Dependencies, EvaluationJob
-from cvcdepth_ros.evaluation.recording import Progress, RecordingScores, evaluate_recording
+from cvcdepth_ros.evaluation.measuring import Progress, RecordingScores, evaluate_recording
 from cvcdepth_ros.evaluation.result import Failure
 
 Outcome = RecordingScores | Failure

@@ -14,15 +14,15 @@ from typing import Any
 
 import torch
 
-from cvcdepth_core.atomic_file import write_atomically, write_json
-from cvcdepth_core.checkpoint import load_checkpoint
 from cvcdepth_core.errors import CvcDepthError
+from cvcdepth_core.files import write_atomically, write_json
+from cvcdepth_core.networks.checkpoint import load_checkpoint
 from cvcdepth_ros.bags import file_identities
 from cvcdepth_ros.evaluation.result import EvaluationResult
 from cvcdepth_ros.finetuning.judgement import camera_numbers, known, numbers_of
 from cvcdepth_ros.finetuning.run import FineTuned
-from cvcdepth_ros.synchronizer import NANOSECONDS
-from cvcdepth_ros.training_index import RecordingIndex
+from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS
+from cvcdepth_ros.training_data.index import RecordingIndex
 from cvcdepth_ros.version import package_version
 
 CARD_FILE, CARD_TEXT_FILE = "model_card.json", "model_card.md"

@@ -10,10 +10,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from cvcdepth_core.comparison import SETS_TO_PROVE, Comparison, Difference, SetValues, compare, compare_values
 from cvcdepth_core.errors import ConfigError
-from cvcdepth_core.scores import ALL, mean
-from cvcdepth_ros.evaluation.frames import ImageScore
+from cvcdepth_core.scoring.comparison import SETS_TO_PROVE, Comparison, Difference, SetValues, compare, compare_values
+from cvcdepth_core.scoring.scores import ALL, mean
+from cvcdepth_ros.evaluation.image_scores import ImageScore
 from cvcdepth_ros.evaluation.result import EvaluationResult
 
 Basis = Literal["LiDAR", "label-free"]

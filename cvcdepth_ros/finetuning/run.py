@@ -7,24 +7,24 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from cvcdepth_core.atomic_file import write_atomically
-from cvcdepth_core.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from cvcdepth_core.distributed import Processes, own_device
 from cvcdepth_core.engines import resolve_device
 from cvcdepth_core.errors import CheckpointError
-from cvcdepth_core.run_folder import CHECKPOINT_FILE
-from cvcdepth_core.starting_model import build_surround_model
-from cvcdepth_core.surround_model import SurroundModel
-from cvcdepth_core.training import RunObserver, Trainer
-from cvcdepth_core.training_config import TrainingConfig
+from cvcdepth_core.files import write_atomically
+from cvcdepth_core.networks.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from cvcdepth_core.training.config import TrainingConfig
+from cvcdepth_core.training.distributed import Processes, own_device
+from cvcdepth_core.training.model import SurroundModel
+from cvcdepth_core.training.run_folder import CHECKPOINT_FILE
+from cvcdepth_core.training.starting_model import build_surround_model
+from cvcdepth_core.training.trainer import RunObserver, Trainer
 from cvcdepth_ros.evaluation.result import EvaluationResult
 from cvcdepth_ros.finetuning.held_out import HeldOutPart, evaluate, held_out_parts, some_sets
-from cvcdepth_ros.finetuning.inputs import inputs_of
 from cvcdepth_ros.finetuning.judgement import Verdict, judge
-from cvcdepth_ros.finetuning.monitoring import TensorBoardObserver, has_tensorboard
 from cvcdepth_ros.finetuning.preparation import Prepared, Source, prepare
+from cvcdepth_ros.finetuning.provenance import inputs_of
+from cvcdepth_ros.finetuning.tensorboard import TensorBoardObserver, has_tensorboard
 from cvcdepth_ros.finetuning.validation import CANDIDATE_FILE, HeldOutValidation
-from cvcdepth_ros.training_samples import RecordingBatches, told_beyond_reach
+from cvcdepth_ros.training_data.samples import RecordingBatches, told_beyond_reach
 from cvcdepth_ros.version import package_version
 
 START_FILE, BEST_FILE = "start.safetensors", "best.safetensors"

@@ -9,9 +9,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cvcdepth_core.images import Picture
-from cvcdepth_core.objective import ObjectiveConfig, Prediction, masked_errors, synthesise_views
-from cvcdepth_core.rig_batch import RigBatch
+from cvcdepth_core.images.decoding import Picture
+from cvcdepth_core.training.batch import RigBatch
+from cvcdepth_core.training.objective import ObjectiveConfig, Prediction, masked_errors, synthesise_views
 from cvcdepth_core.visualization import DepthScale
 
 _GREATEST_ERROR = 0.5  # photometric; of consistent depth: relative

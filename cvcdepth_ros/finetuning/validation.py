@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from cvcdepth_core.training import Trainer, ValidationOutcome
+from cvcdepth_core.training.trainer import Trainer, ValidationOutcome
 from cvcdepth_ros.evaluation.job import EvaluationJob
 from cvcdepth_ros.finetuning.held_out import evaluate
 from cvcdepth_ros.finetuning.judgement import numbers_of

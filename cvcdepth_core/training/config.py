@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The training configuration: typed, validated, read from YAML files that may build on one another."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from cvcdepth_core.errors import ConfigError
+from cvcdepth_core.networks import EncoderName
+from cvcdepth_core.networks.checkpoint import DepthModelSpec
+from cvcdepth_core.training.augmentation import ColorJitterConfig, FlipMode
+from cvcdepth_core.training.model import PoseMethod
+from cvcdepth_core.training.objective import ObjectiveConfig
+from cvcdepth_core.yaml_text import load_yaml
+
+ExposureMotion = Literal["auto", "recorded", "network", "none"]
+
+_BASE_KEY = "base"
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+
+class PoseConfig(_Section):
+    """The pose network."""
+
+    encoder: EncoderName = "resnet18"
+    """Backbone."""
+    method: PoseMethod = "front"
+    """Whose motion is predicted from which images; see `SurroundModel`."""
+
+
+class AugmentationConfig(_Section):
+    """What the networks see differently from the losses."""
+
+    color_jitter: ColorJitterConfig = ColorJitterConfig()
+    """Random colour changes, per camera."""
+    flip: FlipMode = "both"
+    """Hflip-S: which networks see half of the samples mirrored."""
+
+
+class RecordingsConfig(_Section):
+    """Which moments of recordings become training samples, and how they are read."""
+
+    held_out: float = Field(default=0.25, ge=0, lt=1)
+    """The last share of every recording's surround sets that is never trained on."""
+    min_travel: float = Field(default=0.1, ge=0, allow_inf_nan=False)
+    """Metres between a sample's target and each of its context frames, at least; nearer sets are passed over."""
+    min_image_change: float = Field(default=2.0, ge=0, allow_inf_nan=False)
+    """Instead of `min_travel` where no motion is recorded: mean absolute difference of the anchor camera's small grey
+    pictures, of 255."""
+    max_interval: float = Field(default=0.5, gt=0, allow_inf_nan=False)
+    """Seconds from a target to a context frame, at most: a longer gap of the recording is not bridged."""
+    exposure_motion: ExposureMotion = "auto"
+    """How the vehicle moved between the exposures of one set, which tells where each camera was when it fired:
+    `recorded` (odometry or /tf), `network` (as the pose network says, at constant velocity between two sets), `auto`
+    (recorded where there is some, else of the network), or `none`, as in the published method, which takes the
+    exposures as simultaneous. `true` is `auto`, `false` is `none`."""
+    tolerance: float = Field(default=0.1, gt=0, le=10)
+    """Seconds that two images of one set may be apart."""
+    workers: int = Field(default=0, ge=0)
+    """Processes that read and decode; 0 does it in the training process."""
+    cache_mb: int = Field(default=512, ge=0)
+    """Rectified pictures that each process keeps in memory, MB; 0 decodes every picture anew."""
+
+    @field_validator("exposure_motion", mode="before")
+    @classmethod
+    def _exposure_motion_may_be_switched(cls, value: Any) -> Any:
+        return {True: "auto", False: "none"}[value] if isinstance(value, bool) else value
+
+
+class OptimizerConfig(_Section):
+    """Adam, its schedule, and what keeps a step from doing harm."""
+
+    learning_rate: float = Field(default=1e-4, gt=0)
+    """At the start."""
+    betas: tuple[float, float] = (0.9, 0.999)
+    """Decay of Adam's two moments."""
+    epochs: int = Field(default=20, ge=1)
+    """Passes over the training samples."""
+    decay_after_epochs: int = Field(default=15, ge=1)
+    """The learning rate is multiplied by `decay_factor` after every so many epochs."""
+    decay_factor: float = Field(default=0.1, gt=0, le=1)
+    """See `decay_after_epochs`."""
+    weight_decay: float = Field(default=0.0, ge=0)
+    """Decoupled (AdamW); 0 is the published Adam."""
+    samples_per_step: int = Field(default=4, ge=1)
+    """Samples, of all cameras each, whose gradients make one step: processes x samples per process x accumulation."""
+    samples_per_batch: int = Field(default=1, ge=1)
+    """Samples that go through a process's networks together; a divisor of `samples_per_step`."""
+    max_gradient_norm: float | None = Field(default=None, gt=0)
+    """Longer gradients are shortened to this."""
+    average_decay: float | None = Field(default=None, gt=0, lt=1)
+    """Decay per step of the weights' moving average; with it, the average is what is validated and saved."""
+    autocast: Literal["none", "bfloat16"] = "none"
+    """Precision of the networks; views and losses stay in float32."""
+    compile: bool = False
+    """Have torch.compile translate the networks at the first step, which takes minutes and a C++ compiler."""
+
+    @model_validator(mode="after")
+    def _batches_make_steps(self) -> OptimizerConfig:
+        if self.samples_per_step % self.samples_per_batch:
+            raise ValueError(
+                f"samples_per_step is {self.samples_per_step}, expected a multiple of samples_per_batch "
+                f"({self.samples_per_batch})"
+            )
+        return self
+
+
+class EvaluationConfig(_Section):
+    """How predictions are scored."""
+
+    max_depth: float = Field(default=200.0, gt=0, le=1e4)
+    """Metres; ground truth at or beyond it is left out, predictions are clamped to it."""
+    sets: int = Field(default=20, ge=2)
+    """Held-out sets, at most, that a validation during the run scores; at its start and end all are scored."""
+    patience: int | None = Field(default=None, ge=1)
+    """Validations in a row without a better score after which the run ends; null: it never ends early."""
+
+
+class TrainingConfig(_Section):
+    """Everything that decides what a training run computes."""
+
+    dataset: Literal["ddad", "nuscenes", "recording"] = "ddad"
+    """Where samples come from."""
+    depth: DepthModelSpec
+    """The depth network; checkpoints carry this."""
+    pose: PoseConfig = PoseConfig()
+    """The pose network."""
+    objective: ObjectiveConfig = ObjectiveConfig()
+    """Weights and variants of the loss."""
+    augmentation: AugmentationConfig = AugmentationConfig()
+    """What the networks see differently from the losses."""
+    recordings: RecordingsConfig = RecordingsConfig()
+    """For `dataset: recording`: which moments become samples."""
+    optimizer: OptimizerConfig = OptimizerConfig()
+    """Adam, its schedule, and what keeps a step from doing harm."""
+    evaluation: EvaluationConfig = EvaluationConfig()
+    """How predictions are scored."""
+    validate_every: int = Field(default=1, ge=1)
+    """Epochs between two validations; the last epoch is always validated."""
+    checkpoint_every: int = Field(default=200, ge=1)
+    """Steps between two checkpoints; there is one at the end of every epoch too."""
+    pictures_every: int = Field(default=200, ge=1)
+    """Steps between two sets of pictures for those who watch the run, from the first step on."""
+    seed: int = Field(default=42, ge=0)
+    """Of every random draw; how many processes share a step does not change the draws."""
+
+    @model_validator(mode="after")
+    def _pose_consistency_has_poses_to_compare(self) -> TrainingConfig:
+        if self.objective.pose_consistency > 0 and self.pose.method != "per_camera":
+            raise ValueError(
+                f"objective.pose_consistency is {self.objective.pose_consistency}, which compares the cameras' own "
+                f"motions, but pose.method is {self.pose.method!r}, expected 'per_camera'"
+            )
+        return self
+
+
+def load_training_config(path: str | Path) -> TrainingConfig:
+    """Read a training configuration; `base: FILE` names a file, relative to this one, that it builds on.
+
+    Raises ConfigError naming the file, the field, the value found and what is allowed.
+    """
+    path = Path(path)
+    try:
+        return TrainingConfig.model_validate(_read_with_bases(path, above=()))
+    except ValidationError as error:
+        raise ConfigError(
+            f"{path}: {'; '.join(_describe(item) for item in error.errors(include_url=False))}"
+        ) from error
+
+
+def _read_with_bases(path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
+    if path.resolve() in above:
+        raise ConfigError(f"{path}: {_BASE_KEY} leads back to the file itself")
+    fields = _read_yaml(path)
+    base = fields.pop(_BASE_KEY, None)
+    if base is None:
+        return fields
+    if not isinstance(base, str):
+        raise ConfigError(f"{path}: {_BASE_KEY} is {base!r}, expected the name of a file")
+    return _overlay(_read_with_bases(path.parent / base, (*above, path.resolve())), fields)
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        content = load_yaml(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigError(f"{path}: cannot be read: {' '.join(str(error).split())}") from error
+    if not isinstance(content, dict):
+        raise ConfigError(f"{path}: holds a {type(content).__name__}, expected fields with values")
+    return content
+
+
+def _overlay(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(base)
+    for key, value in changes.items():
+        below = merged.get(key)
+        merged[key] = _overlay(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
+    return merged
+
+
+def _describe(item: Mapping[str, Any]) -> str:
+    name = ".".join(map(str, item["loc"]))
+    if item["type"] == "extra_forbidden":
+        return f"{name} is no known field; {_known_fields(item['loc'])}"
+    if item["type"] == "missing":
+        return f"{name} is missing"
+    if not name:
+        return str(item["msg"])
+    return f"{name} is {item['input']!r}: {item['msg']}"
+
+
+def _known_fields(location: tuple[str | int, ...]) -> str:
+    section: Any = TrainingConfig
+    for part in location[:-1]:
+        section = section.model_fields[part].annotation
+    return f"expected one of {', '.join(section.model_fields)}"

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The two networks applied to a rig: depth and motion of every camera (method sections 3, 4, 7 and 8)."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from cvcdepth_core.networks import DepthNet, PoseNet, disparity_to_depth
+from cvcdepth_core.training.augmentation import mirror, mirror_motion
+from cvcdepth_core.training.batch import RigBatch
+from cvcdepth_core.training.motion import distribute_anchor_motion, distribute_vehicle_motion, motion_to_context
+from cvcdepth_core.training.objective import Prediction
+
+PoseMethod = Literal["front", "joint_front", "joint", "per_camera"]
+
+_VEHICLE_LATERAL_AXIS = 1
+
+
+class MotionVector(NamedTuple):
+    """The pose network's answer."""
+
+    axis_angle: Tensor
+    """[..., 3] rad."""
+    translation: Tensor
+    """[..., 3] metres."""
+
+
+class SurroundModel(nn.Module):
+    """Depth of every camera and motion of every camera from a rig's images.
+
+    `pose_method` says which images the pose network sees and whose motion it gives: the anchor (front) camera's from
+    its own images (`front`, the paper's) or from all images (`joint_front`, VFDepth), the vehicle's from all images
+    (`joint`, SurroundDepth), or each camera's from its own (`per_camera`, FSM; wants the pose-consistency term).
+    """
+
+    def __init__(
+        self,
+        depth_net: DepthNet,
+        pose_net: PoseNet,
+        *,
+        min_depth: float,
+        max_depth: float,
+        focal_scale: float = 300.0,
+        pose_method: PoseMethod = "front",
+    ) -> None:
+        super().__init__()
+        self.depth_net = depth_net
+        self.pose_net = pose_net
+        self.min_depth, self.max_depth, self.focal_scale = min_depth, max_depth, focal_scale
+        self.pose_method = pose_method
+
+    def forward(self, batch: RigBatch, network_frames: Tensor, depth_flips: Tensor, pose_flips: Tensor) -> Prediction:
+        """Return disparity, depth and motions for `batch`.
+
+        `network_frames` [B, 3, N, 3, H, W] are the batch's frames (0, -1, +1) as the networks shall see them, jittered
+        in training. The samples named by `depth_flips` and `pose_flips` (bool [B]) are shown mirrored to that network
+        and the answer is mirrored back (Hflip-S). Under autocast only the networks run in half precision.
+        """
+        disparity = self._disparity(network_frames[:, 0], depth_flips)
+        vectors = self._motion_vectors(batch, mirror(network_frames, pose_flips))
+        with torch.autocast(network_frames.device.type, enabled=False):
+            depth = disparity_to_depth(
+                disparity, batch.intrinsics[..., 0, 0], self.min_depth, self.max_depth, self.focal_scale
+            )
+            return Prediction(disparity, depth, self._motions(batch, vectors, pose_flips))
+
+    def _disparity(self, images: Tensor, flips: Tensor) -> Tensor:
+        samples, cameras = images.shape[:2]
+        disparity: Tensor = self.depth_net(mirror(images, flips).flatten(0, 1)).to(images.dtype)
+        return mirror(disparity.view(samples, cameras, *disparity.shape[1:]), flips)
+
+    def _motion_vectors(self, batch: RigBatch, frames: Tensor) -> list[MotionVector]:
+        """Return what the pose network says for the frames -1 and +1: per sample [B, 3], or per camera [B*N, 3]."""
+        target, before, after = self._pose_views(batch, frames).unbind(1)
+        return [
+            MotionVector(*(part.to(frames.dtype) for part in self.pose_net(earlier, later)))
+            for earlier, later in ((before, target), (target, after))
+        ]
+
+    def _pose_views(self, batch: RigBatch, frames: Tensor) -> Tensor:
+        """Choose from `frames` [B, 3, N, 3, H, W] the views that share a motion: [B, 3, V, ...] or [B*N, 3, 1, ...]."""
+        if self.pose_method == "front":
+            return frames[:, :, batch.anchor, None]
+        if self.pose_method == "per_camera":
+            return frames.transpose(1, 2).flatten(0, 1).unsqueeze(2)
+        return frames
+
+    def _motions(self, batch: RigBatch, vectors: list[MotionVector], flips: Tensor) -> Tensor:
+        """Return the motions [B, 2, N, 4, 4] of all cameras, from exposure to exposure, to the frames -1 and +1."""
+        before, after = vectors
+        raw = [motion_to_context(*before, backward=True), motion_to_context(*after, backward=False)]
+        motions = torch.stack([motion.view(len(flips), -1, 4, 4) for motion in raw], dim=1)
+        motions = mirror_motion(motions, flips, _VEHICLE_LATERAL_AXIS if self.pose_method == "joint" else 0)
+        if self.pose_method == "per_camera":
+            return motions
+        motion = motions.squeeze(2)
+        if self.pose_method == "joint":
+            anchors = distribute_vehicle_motion(motion, batch.base_T_camera)[:, :, batch.anchor]
+            return distribute_vehicle_motion(motion, batch.at_exposures(anchors).base_T_camera)
+        return distribute_anchor_motion(motion, batch.at_exposures(motion).base_T_camera, batch.anchor)

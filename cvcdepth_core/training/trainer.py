@@ -1,0 +1,438 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The training loop: plain torch, one process or several, to be killed and resumed at any moment.
+
+Every sample's random draws come from a generator seeded by the configuration's seed, the step's number and the sample's
+place in the step, and the batches of an epoch from seed and epoch. So a resumed run computes exactly what an
+uninterrupted one does, a checkpoint needs no generator's state, and it does not matter how many processes share a step.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any, Protocol, cast
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel
+from tqdm import tqdm
+
+from cvcdepth_core.errors import ConfigError, TrainingError
+from cvcdepth_core.networks.checkpoint import save_checkpoint
+from cvcdepth_core.training.augmentation import draw_flips, jitter_colors
+from cvcdepth_core.training.batch import RigBatch
+from cvcdepth_core.training.config import AugmentationConfig, TrainingConfig
+from cvcdepth_core.training.distributed import ALONE, Processes, share_batch_statistics
+from cvcdepth_core.training.model import SurroundModel
+from cvcdepth_core.training.objective import ObjectiveValue, Prediction, evaluate_objective
+from cvcdepth_core.training.run_folder import RunFolder, RunIdentity
+
+_MAX_SKIPPED_IN_A_ROW = 20
+
+
+@dataclass(frozen=True)
+class ValidationOutcome:
+    """What a validation found."""
+
+    scores: Mapping[str, float]
+    """They go to the log."""
+    stop: bool = False
+    """Whether the run ends here, before its configured epochs (early stopping)."""
+
+
+Validation = Callable[["Trainer"], ValidationOutcome]
+"""Scores the trainer's `result`, then in evaluation mode; its `validations` tell what was found before."""
+
+
+class RunObserver(Protocol):
+    """Is told what a run does while it does it; what it takes long for, the run waits for."""
+
+    def on_step(self, trainer: Trainer, entry: Mapping[str, Any]) -> None:
+        """Take what was logged of a step."""
+
+    def on_pictures(self, trainer: Trainer, batch: RigBatch, prediction: Prediction) -> None:
+        """Take the first sample of a step and what the networks said of it, every `pictures_every` steps."""
+
+    def on_validation(self, trainer: Trainer, entry: Mapping[str, Any]) -> None:
+        """Take what was logged of a validation."""
+
+
+class Batches(Protocol):
+    """Where a process's training batches come from; their order must depend on the epoch's number only.
+
+    Several processes take the parts of the same batches: sample i of process r's part is sample i * count + r of the
+    whole, and all have as many batches.
+    """
+
+    @property
+    def samples(self) -> int:
+        """Samples of one epoch, of all processes together."""
+
+    def epoch(self, number: int, first: int = 0) -> Iterator[RigBatch | None]:
+        """Give the batches of an epoch from the `first` on; None for one that could not be read."""
+
+
+@dataclass
+class Progress:
+    """How far a run is."""
+
+    epoch: int = 0
+    """Epochs that are complete."""
+    batch: int = 0
+    """Batches that are done of the epoch in work."""
+    step: int = 0
+    """Optimiser steps, skipped ones too."""
+    skipped: int = 0
+    """Steps that were left out since their loss or gradient was not finite."""
+    unreadable: int = 0
+    """Batches none of whose samples could be read."""
+    stopped: bool = False
+    """Whether a validation has ended the run."""
+
+
+class Trainer:
+    """Trains a model on batches into a run folder, from where the folder's last checkpoint stands."""
+
+    def __init__(
+        self,
+        config: TrainingConfig,
+        model: SurroundModel,
+        batches: Batches,
+        run_directory: Path,
+        device: torch.device | str = "cpu",
+        validate: Validation | None = None,
+        metadata: Mapping[str, str] | None = None,
+        observers: Sequence[RunObserver] = (),
+        processes: Processes = ALONE,
+        inputs: Mapping[str, str] | None = None,
+    ) -> None:
+        """`metadata` travels in the checkpoints. Of several `processes`, the first alone validates, writes and tells.
+
+        `inputs` name what the run is made from beside its configuration; it is resumed with the same only.
+        Raises CheckpointError when the folder holds another run, ConfigError when the processes cannot share a step,
+        TrainingError when they have not found the same samples.
+        """
+        _refuse_uneven_shares(config, processes)
+        _refuse_different_samples(batches.samples, processes)
+        self.config = config
+        self.progress = Progress()
+        self.validations: list[dict[str, Any]] = []
+        """What was logged of every validation."""
+        self._device = torch.device(device)
+        self.model = _prepared(model, self._device, processes)
+        self._batches = batches
+        self._processes = processes
+        self._validate = validate
+        self._observers = tuple(observers) if processes.is_first else ()
+        self._metadata = dict(metadata or {})
+        self._inputs: dict[str, str] = json.loads(processes.told_by_first(json.dumps(dict(inputs or {})).encode()))
+        self._folder = RunFolder(run_directory)
+        self._optimizer = torch.optim.AdamW(
+            self.model.parameters(),
+            lr=config.optimizer.learning_rate,
+            betas=config.optimizer.betas,
+            fused=True,
+            weight_decay=config.optimizer.weight_decay,
+        )
+        self._average = _averaged(self.model, config.optimizer.average_decay)
+        self._skipped_in_a_row = 0
+        if config.optimizer.compile:
+            _compile(self.model)
+        if processes.is_first:
+            self._folder.create()
+        self._resume()
+
+    @property
+    def result(self) -> SurroundModel:
+        """The model that is validated and saved: the weights' average, or the weights where none is kept."""
+        return self.model if self._average is None else cast(SurroundModel, self._average.module)
+
+    def train(self, quiet: bool = False) -> None:
+        """Train to the configured number of epochs or until a validation ends the run; it then stays ended.
+
+        Raises TrainingError when the loss stays non-finite.
+        """
+        if self._processes.is_first:
+            self._folder.write_config(self.config)
+        epochs = self.config.optimizer.epochs
+        if self.progress.step == 0 and not self.validations:
+            self._score()
+            self.save()
+        total, hidden = epochs * self._batches.samples, True if quiet or not self._processes.is_first else None
+        with tqdm(total=total, initial=self._samples_done, unit="sample", disable=hidden) as bar:
+            while self.progress.epoch < epochs and not self.progress.stopped:
+                self._train_epoch(bar)
+                if self.progress.epoch % self.config.validate_every == 0 or self.progress.epoch == epochs:
+                    self._score()
+                self.save()
+
+    def save(self) -> None:
+        """Write what resuming needs, then the checkpoint; each appears complete or not at all."""
+        if not self._processes.is_first:
+            return
+        self._folder.write_state(
+            {
+                **self._identity.to_state(),
+                "progress": asdict(self.progress),
+                "validations": json.dumps(self.validations),
+                "model": self.model.state_dict(),
+                "average": None if self._average is None else self._average.state_dict(),
+                "optimizer": self._optimizer.state_dict(),
+            }
+        )
+        self.save_result(self._folder.checkpoint)
+
+    def save_result(self, path: Path) -> None:
+        """Write `result` as a checkpoint."""
+        save_checkpoint(
+            path,
+            self.config.depth,
+            self.result.depth_net.state_dict(),
+            self.result.pose_net.state_dict(),
+            {**self._metadata, "step": str(self.progress.step), "epoch": str(self.progress.epoch)},
+        )
+
+    @property
+    def _identity(self) -> RunIdentity:
+        return RunIdentity(self.config, self._batches.samples, self._samples_together, self._inputs)
+
+    @property
+    def _samples_together(self) -> int:
+        """Samples that go through the networks of all processes together, sharing batch statistics."""
+        return self.config.optimizer.samples_per_batch * self._processes.count
+
+    @property
+    def _samples_done(self) -> int:
+        """Samples of this and the former epochs that steps were made of."""
+        samples = self._batches.samples
+        return self.progress.epoch * samples + min(self.progress.batch * self._samples_together, samples)
+
+    def _resume(self) -> None:
+        content = self._processes.told_by_first(self._folder.read_state() if self._processes.is_first else b"")
+        if content:
+            state = self._folder.state_from(content)
+            self._identity.refuse_other(state, self._folder.state)
+            self.progress = Progress(**state["progress"])
+            self.validations = json.loads(state["validations"])
+            self.model.load_state_dict(state["model"])
+            self._optimizer.load_state_dict(state["optimizer"])
+            if self._average is not None:
+                self._average.load_state_dict(state["average"])
+        if self._processes.is_first:
+            self._folder.drop_remains(self.progress.step, self.validations)
+
+    def _train_epoch(self, bar: tqdm[Any]) -> None:
+        optimizer = self.config.optimizer
+        decays = self.progress.epoch // optimizer.decay_after_epochs
+        for group in self._optimizer.param_groups:
+            group["lr"] = optimizer.learning_rate * optimizer.decay_factor**decays
+        batches = self._batches.epoch(self.progress.epoch, self.progress.batch)
+        length = optimizer.samples_per_step // self._samples_together
+        self.model.train()
+        while True:
+            began = time.perf_counter()
+            if not (batches_of_step := list(islice(batches, length))):
+                break
+            entry = {"seconds_waiting": round(time.perf_counter() - began, 4), **self._step(batches_of_step)}
+            entry["seconds"] = round(time.perf_counter() - began, 4)
+            self.progress.batch += len(batches_of_step)
+            self._log(entry)
+            for observer in self._observers:
+                observer.on_step(self, entry)
+            bar.update(self._samples_done - bar.n)
+            bar.set_postfix(loss=entry["loss"], skipped=self.progress.skipped)
+            if self.progress.step % self.config.checkpoint_every == 0:
+                self.save()
+        self.progress.epoch += 1
+        self.progress.batch = 0
+
+    def _step(self, batches: Sequence[RigBatch | None]) -> dict[str, Any]:
+        """Make one optimiser step of several batches; return what is logged of it."""
+        self.progress.step += 1
+        readable = self._readable_by_all(batches)
+        self.progress.unreadable += len(batches) - len(readable)
+        self._optimizer.zero_grad(set_to_none=True)
+        values = [self._backpropagate(batch.to(self._device), place) for place, batch in readable.items()]
+        samples, loss, terms = self._means(values)
+        norm = self._mean_gradient_norm(samples)
+        self._update_weights(math.isfinite(loss) and math.isfinite(norm), samples)
+        return {
+            "step": self.progress.step,
+            "epoch": self.progress.epoch,
+            "samples": samples,
+            "loss": loss,
+            "terms": terms,
+            "gradient_norm": norm,
+            "learning_rate": self._optimizer.param_groups[0]["lr"],
+            "skipped": self.progress.skipped,
+        }
+
+    def _readable_by_all(self, batches: Sequence[RigBatch | None]) -> dict[int, RigBatch]:
+        """Return the batches, by their place in the step, of which every process could read something.
+
+        The processes have to go through the networks as often, or they would wait for each other's statistics for ever.
+        """
+        missing = torch.tensor([float(batch is None) for batch in batches], device=self._device)
+        somewhere = self._processes.add_up(missing).tolist()
+        return {place: batch for place, batch in enumerate(batches) if batch is not None and not somewhere[place]}
+
+    def _backpropagate(self, batch: RigBatch, place: int) -> ObjectiveValue:
+        """Add the gradients of the batch's samples, summed, not averaged: the last batch of an epoch may be smaller."""
+        config = self.config
+        generators = [
+            _generator(config.seed, self.progress.step, place * self._samples_together + sample)
+            for sample in range(self._processes.rank, self._processes.count * len(batch.frames), self._processes.count)
+        ]
+        seen, depth_flips, pose_flips = _augment(batch, config.augmentation, generators)
+        with torch.autocast(self._device.type, torch.bfloat16, config.optimizer.autocast == "bfloat16"):
+            prediction = self.model(batch, seen, depth_flips, pose_flips)
+        value = evaluate_objective(batch, prediction, config.objective, _identity_noise(batch, generators))
+        value.per_sample.sum().backward()  # type: ignore[no-untyped-call]
+        if place == 0 and (self.progress.step - 1) % config.pictures_every == 0:
+            for observer in self._observers:
+                observer.on_pictures(self, batch.first_sample(), prediction.first_sample())
+        return ObjectiveValue(value.per_sample.detach(), {name: term.detach() for name, term in value.terms.items()})
+
+    def _means(self, values: Sequence[ObjectiveValue]) -> tuple[int, float, dict[str, float]]:
+        """Return the number of samples of all processes, their mean loss and the means of its terms."""
+        if not values:
+            return 0, 0.0, {}
+        columns = {"": [value.per_sample for value in values]}
+        columns |= {name: [value.terms[name].flatten() for value in values] for name in values[0].terms}
+        joined = [torch.cat(column).double() for column in columns.values()]
+        sums = torch.stack([torch.stack([column.sum(), torch.ones_like(column).sum()]) for column in joined])
+        totals, counts = self._processes.add_up(sums).unbind(1)
+        means = dict(zip(columns, (totals / counts).tolist(), strict=True))
+        return int(counts[0]), means.pop(""), means
+
+    def _mean_gradient_norm(self, samples: int) -> float:
+        """Turn the gradients' sum into the mean of all processes and shorten it if configured; return its length."""
+        self._processes.add_up_gradients(list(self.model.parameters()))
+        for parameter in self.model.parameters():
+            if parameter.grad is not None:
+                parameter.grad /= max(samples, 1)
+        limit = self.config.optimizer.max_gradient_norm or math.inf
+        return float(nn.utils.clip_grad_norm_(self.model.parameters(), limit))
+
+    def _update_weights(self, is_finite: bool, samples: int) -> None:
+        if is_finite and samples:
+            self._optimizer.step()
+            if self._average is not None:
+                self._average.update_parameters(self.model)
+            self._skipped_in_a_row = 0
+            return
+        self.progress.skipped += 1
+        self._skipped_in_a_row += 1
+        if self._skipped_in_a_row >= _MAX_SKIPPED_IN_A_ROW:
+            raise TrainingError(
+                f"step {self.progress.step}: loss or gradient is not finite, or no sample could be read, for "
+                f"{_MAX_SKIPPED_IN_A_ROW} steps in a row; {self._folder.checkpoint} is the last good checkpoint"
+            )
+
+    def _score(self) -> None:
+        if self._validate is None:
+            return
+        scores = self._scores(self._validate) if self._processes.is_first else b""
+        entry = json.loads(self._processes.told_by_first(scores))
+        self.progress.stopped = entry["stop"]
+        self.validations.append(entry)
+        self._log(entry)
+        for observer in self._observers:
+            observer.on_validation(self, entry)
+
+    def _scores(self, validate: Validation) -> bytes:
+        """Validate; return what is logged of it, as JSON."""
+        was_training = self.result.training
+        self.result.eval()
+        with torch.inference_mode():
+            outcome = validate(self)
+        self.result.train(was_training)
+        place = {"step": self.progress.step, "epoch": self.progress.epoch}
+        return json.dumps({**place, "validation": dict(outcome.scores), "stop": outcome.stop}).encode()
+
+    def _log(self, entry: Mapping[str, Any]) -> None:
+        if self._processes.is_first:
+            self._folder.append_to_log(entry)
+
+
+def _prepared(model: SurroundModel, device: torch.device, processes: Processes) -> SurroundModel:
+    # On CPUs, channels-last makes a step of the networks a fifth to a third shorter.
+    model = model.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return model if processes.count == 1 else cast(SurroundModel, share_batch_statistics(model, device))
+
+
+def _refuse_uneven_shares(config: TrainingConfig, processes: Processes) -> None:
+    together, step = config.optimizer.samples_per_batch * processes.count, config.optimizer.samples_per_step
+    if step % together:
+        raise ConfigError(
+            f"optimizer.samples_per_step is {step}, expected a multiple of {together}: samples_per_batch "
+            f"({config.optimizer.samples_per_batch}) x {processes.count} processes"
+        )
+
+
+def _refuse_different_samples(samples: int, processes: Processes) -> None:
+    first = int(processes.told_by_first(str(samples).encode()))
+    if samples != first:
+        raise TrainingError(
+            f"process {processes.rank} has {samples} samples, the first has {first}: the machines do not have the same "
+            "recordings"
+        )
+
+
+def _compile(model: SurroundModel) -> None:
+    """Have torch translate the networks, not the objective, which is many small steps on small tensors."""
+    compiler = os.environ.get("CXX", "g++")
+    if shutil.which(compiler) is None:
+        raise ConfigError(
+            f"optimizer.compile is true, but torch.compile needs a C++ compiler and {compiler!r} is not there; install "
+            "g++, name another in the environment variable CXX, or leave compile off"
+        )
+    model.depth_net.compile()
+    model.pose_net.compile()
+
+
+def _generator(seed: int, step: int, place: int) -> torch.Generator:
+    """Return the generator of the sample at `place` of a step."""
+    state = np.random.SeedSequence([seed, step, place]).generate_state(1)
+    return torch.Generator().manual_seed(int(state[0]))
+
+
+def _augment(
+    batch: RigBatch, config: AugmentationConfig, generators: Sequence[torch.Generator]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Draw what the networks see: jittered frames, and which samples each network sees mirrored."""
+    seen = jitter_colors(batch.frames, config.color_jitter, generators)
+    flips = draw_flips(generators).to(batch.frames.device)
+    none = torch.zeros_like(flips)
+    depth_flips = flips if config.flip in ("depth", "both") else none
+    return seen, depth_flips, flips if config.flip in ("pose", "both") else none
+
+
+def _identity_noise(batch: RigBatch, generators: Sequence[torch.Generator]) -> Tensor:
+    """Draw the objective's noise on the batch's device, where there may be much to draw."""
+    contexts = batch.contexts[:, :, :, :1]
+    noise = torch.empty_like(contexts)
+    for sample, generator in zip(noise, generators, strict=True):
+        seed = int(torch.randint(2**31, (), generator=generator))
+        sample.normal_(generator=torch.Generator(noise.device).manual_seed(seed))
+    return noise
+
+
+def _averaged(model: SurroundModel, decay: float | None) -> AveragedModel | None:
+    """Return the moving average of the weights; while it is young it forgets faster, so as not to keep the start."""
+    if decay is None:
+        return None
+
+    def update(average: Tensor, current: Tensor, updates: Tensor | int) -> Tensor:
+        young = (1 + int(updates)) / (10 + int(updates))
+        return torch.lerp(average, current, 1 - min(decay, young))
+
+    return AveragedModel(model, avg_fn=update)

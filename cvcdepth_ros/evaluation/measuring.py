@@ -1,0 +1,272 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One recording's scores: every set's depth, by the node's own path, against LiDAR and against itself."""
+
+from __future__ import annotations
+
+import json
+from array import array
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from cvcdepth_core.errors import RecordingError
+from cvcdepth_core.rig.poses import Pose
+from cvcdepth_core.scoring.consistency import AgreementTable, PosedDepth, spatial_rows, temporal_rows
+from cvcdepth_core.scoring.ground_truth import PinholeView, SparseDepth, overlap_pixels, sample_prediction
+from cvcdepth_core.scoring.scores import DepthSamples, Scores, SurroundScorer
+from cvcdepth_core.visualization import Points
+from cvcdepth_ros.bags import open_recording
+from cvcdepth_ros.evaluation.job import EvaluationJob
+from cvcdepth_ros.recordings.replay import DepthReplay, EstimatedSet, SurroundReplay
+from cvcdepth_ros.recordings.rig import discover_rig
+from cvcdepth_ros.recordings.truth import RecordedTruth
+from cvcdepth_ros.surround_sets.latencies import StageLatencies
+from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS
+
+Progress = Callable[[float], None]
+"""Told which share of the recording is done."""
+
+_LONGEST_STEP_NS = NANOSECONDS  # between two sets that are compared along the vehicle's way
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredSet:
+    """One set's depth and what the recording tells of the truth."""
+
+    estimated: EstimatedSet
+    truth: Sequence[SparseDepth]
+    """Of each camera, in the rig's order, at its picture's full size; empty where there is none."""
+    world_T_base: Sequence[Pose] | None
+    """The vehicle's pose at each camera's moment; None where the recording does not tell."""
+    lidar: Points | None
+    """[M, 3] metres in the base frame at the anchor's moment."""
+
+    @property
+    def stamp_ns(self) -> int:
+        """The anchor's stamp."""
+        return self.estimated.images.stamp_ns
+
+    @property
+    def log_time(self) -> int:
+        """When the set's last image was recorded, ns."""
+        return _log_time(self.estimated)
+
+    @property
+    def posed(self) -> PosedDepth:
+        """The depth with the cameras' places."""
+        return PosedDepth.of(self.estimated.depth, self.estimated.rig, self.world_T_base)
+
+    def samples(self) -> list[DepthSamples]:
+        """Return what is scored of each camera."""
+        rig, depth = self.estimated.rig, self.estimated.depth.depth
+        views = {camera.name: PinholeView.of(camera) for camera in rig.cameras}
+        found = []
+        for name, truth, prediction in zip(rig.names, self.truth, depth, strict=True):
+            others = [views[other] for other in rig.neighbours[name]]
+            overlap = overlap_pixels(truth, views[name], others)
+            found.append(DepthSamples(sample_prediction(prediction, truth), truth.depth, overlap))
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class RecordingScores:
+    """All that was found out about one recording."""
+
+    name: str
+    summary: dict[str, Any]
+    """What was read and used, with JSON's types."""
+    scores: Scores
+    agreement: AgreementTable
+    log_times: NDArray[np.int64]
+    """[S] when each set was recorded, ns."""
+
+    def to_arrays(self) -> dict[str, NDArray[Any]]:
+        """Return everything as arrays that numpy stores without pickling."""
+        described = {
+            "name": self.name,
+            "summary": self.summary,
+            "scores": self.scores.to_json(),
+            "pairs": self.agreement.pairs,
+        }
+        text = np.frombuffer(json.dumps(described).encode(), dtype=np.uint8)
+        return {"described": text, "agreement": self.agreement.columns, "log_times": self.log_times}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> RecordingScores:
+        """Undo `to_arrays`; KeyError, ValueError or ConfigError where the arrays are others."""
+        described = json.loads(arrays["described"].tobytes())
+        pairs = [(kind, camera, other) for kind, camera, other in described["pairs"]]
+        return cls(
+            described["name"],
+            described["summary"],
+            Scores.from_json(described["scores"]),
+            AgreementTable(pairs, arrays["agreement"]),
+            arrays["log_times"],
+        )
+
+
+class RecordingEvaluation:
+    """One opened recording, ready to be measured; make it with `open_evaluation`."""
+
+    def __init__(self, job: EvaluationJob, replay: SurroundReplay) -> None:
+        self.job = job
+        self.replay = replay
+        self.truth = RecordedTruth(replay, job.lidar, job.settings.lidar_tolerance)
+        self.depths = DepthReplay(replay, job.settings.build_predictor(replay.rig))
+
+    @property
+    def window(self) -> tuple[int, int]:
+        """First and last (exclusive) log time, ns."""
+        start = self.replay.recording.start + round(self.job.start * NANOSECONDS)
+        end = self.replay.recording.end + 1
+        return start, end if self.job.duration is None else min(end, start + round(self.job.duration * NANOSECONDS))
+
+    def sets(self, start: int, stop: int, stamp_ns: int | None = None) -> Iterator[MeasuredSet]:
+        """Give the sets of start <= log_time < stop (ns), in order; with a stamp, the set of that stamp only."""
+        ahead = self.truth.ahead_ns
+        self.truth.read(start - ahead, start)
+        pending: deque[EstimatedSet] = deque()
+        for estimated in self.depths.sets(start, stop, self.truth.handlers, stamp_ns):
+            pending.append(estimated)
+            while _log_time(pending[0]) + ahead < _log_time(estimated):
+                yield self._measured(pending.popleft())
+        self.truth.read(stop, stop + ahead)
+        yield from map(self._measured, pending)
+
+    def scores(self, progress: Progress | None = None) -> RecordingScores:
+        """Score every set of the job's part. Raises RecordingError, saying why, when there is none."""
+        start, stop = self.window
+        scoring = _Scoring(self.job, self.replay.rig.names, self.latencies)
+        for measured in self.sets(start, stop):
+            scoring.add(measured)
+            if progress is not None:
+                progress(min(1.0, (measured.log_time - start) / (stop - start)))
+        if not scoring.sets:
+            raise RecordingError(f"{self.job.path}: no set: {self.depths.why_no_set(*self.window)}")
+        return scoring.result(_summary(self, scoring))
+
+    @property
+    def latencies(self) -> StageLatencies:
+        """Where the time went."""
+        return self.depths.latencies
+
+    def _measured(self, estimated: EstimatedSet) -> MeasuredSet:
+        images, rig = estimated.images, estimated.rig
+        with self.latencies.measure("truth"):
+            truth = self.truth.camera_depth(rig, images.times_ns, self.job.settings.occlusion)
+            poses = self.truth.base_poses(rig, images.times_ns)
+            lidar = self.truth.points(images.time_ns)
+            self.truth.forget_before(min(images.times_ns.values()))
+        return MeasuredSet(estimated, truth, poses, lidar)
+
+
+@contextmanager
+def open_evaluation(job: EvaluationJob) -> Iterator[RecordingEvaluation]:
+    """Open the job's recording; the errors of the family name what is missing.
+
+    The network runs in as many CPU threads as the settings say; what torch had before is restored at the end.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(job.settings.threads)
+    try:
+        with open_recording(job.path) as recording:
+            layout = job.layout or discover_rig(recording, job.base_frame)
+            yield RecordingEvaluation(job, SurroundReplay(recording, layout, job.settings))
+    finally:
+        torch.set_num_threads(threads)
+
+
+def evaluate_recording(job: EvaluationJob, progress: Progress | None = None) -> RecordingScores:
+    """Score every set of a recording. Raises RecordingError, saying why, when there is none."""
+    with open_evaluation(job) as evaluation:
+        return evaluation.scores(progress)
+
+
+def measured_set(job: EvaluationJob, stamp_ns: int, log_time: int) -> MeasuredSet:
+    """Measure one set again, which is known by its stamp and log time (ns); RecordingError when it is not there."""
+    with open_evaluation(job) as evaluation:
+        for measured in evaluation.sets(log_time - 2 * NANOSECONDS, log_time + NANOSECONDS, stamp_ns):
+            return measured
+    raise RecordingError(f"{job.path}: no set at {stamp_ns} ns")
+
+
+class _Scoring:
+    """Adds up one recording's sets."""
+
+    def __init__(self, job: EvaluationJob, cameras: Sequence[str], latencies: StageLatencies) -> None:
+        self._job = job
+        self._latencies = latencies
+        self._scorer = SurroundScorer(job.name, cameras, job.settings.scores)
+        self._agreement = AgreementTable()
+        self._earlier: tuple[int, PosedDepth] | None = None
+        self._log_times = array("q")
+        self.sets_with_truth = 0
+        self.truth_points = 0
+
+    def add(self, measured: MeasuredSet) -> None:
+        """Score one set; sets come in order."""
+        with self._latencies.measure("score"):
+            points = self._scorer.add(measured.stamp_ns, measured.samples())
+        self.truth_points += points
+        self.sets_with_truth += points > 0
+        with self._latencies.measure("label-free"), torch.inference_mode():
+            self._compare(measured)
+        self._log_times.append(measured.log_time)
+
+    @property
+    def sets(self) -> int:
+        """Sets that were scored."""
+        return len(self._log_times)
+
+    def result(self, summary: dict[str, Any]) -> RecordingScores:
+        """Return what was found."""
+        log_times = np.array(self._log_times, dtype=np.int64)
+        return RecordingScores(self._job.name, summary, self._scorer.scores(), self._agreement, log_times)
+
+    def _compare(self, measured: MeasuredSet) -> None:
+        stamp, rig, posed = measured.stamp_ns, measured.estimated.rig, measured.posed
+        limit = self._job.settings.max_depth
+        self._agreement.add(self.sets, spatial_rows(rig, posed, limit))
+        if measured.world_T_base is None:
+            self._earlier = None
+            return
+        if self._earlier is not None and stamp - self._earlier[0] <= _LONGEST_STEP_NS:
+            self._agreement.add(self.sets, temporal_rows(rig, posed, self._earlier[1], limit))
+        self._earlier = stamp, posed
+
+
+def _summary(evaluation: RecordingEvaluation, scoring: _Scoring) -> dict[str, Any]:
+    replay, depths, truth = evaluation.replay, evaluation.depths, evaluation.truth
+    recording, statistics = replay.recording, replay.statistics
+    return {
+        "name": evaluation.job.name,
+        "path": evaluation.job.path,
+        "model": depths.estimator.model_id,
+        "cameras": replay.layout.names,
+        "anchor": replay.layout.anchor_camera,
+        "seconds": (recording.end - recording.start) / NANOSECONDS,
+        "lidar": list(truth.topics),
+        "clouds_of_cameras": list(truth.left_out),
+        "motion": truth.motion.topic if truth.motion else None,
+        "sets": {
+            "scored": scoring.sets,
+            "with_truth": scoring.sets_with_truth,
+            "matched": statistics.sets,
+            "incomplete": sum(statistics.cameras[replay.layout.anchor_camera].dropped.values()),
+            "refused": depths.refused.count,
+        },
+        "truth_points": scoring.truth_points,
+        "refused": depths.refused.reasons + replay.unreadable.reasons,
+        "truth_refused": {"count": truth.refused.count, "reasons": truth.refused.reasons[:10]},
+        "damage": recording.damage,
+    }
+
+
+def _log_time(estimated: EstimatedSet) -> int:
+    return max(image.log_time for image in estimated.images.images.values())

@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Complete a rig file with what a recording or a live system says: CameraInfo and static transforms."""
+
+from collections.abc import Collection
+from typing import Any
+
+from cvcdepth_core.errors import RigError, TransformError
+from cvcdepth_core.rig.calibration import Calibration
+from cvcdepth_core.rig.poses import Pose
+from cvcdepth_core.rig.rig import Camera, CameraEntry, PoseEntry, Rig, RigLayout, order_around_vehicle
+from cvcdepth_ros.messages.conversion import calibration_from_message
+from cvcdepth_ros.messages.transforms import TransformTree
+
+
+class RigAssembler:
+    """Collects calibrations until a layout's cameras are complete."""
+
+    def __init__(self, layout: RigLayout, transforms: TransformTree | None = None) -> None:
+        """Use `transforms`, the tree to which whoever receives static transforms adds them."""
+        self.layout = layout
+        self.transforms = TransformTree() if transforms is None else transforms
+        self.frames_on_tf: list[str] = []
+        """Sensor frames whose fixed poses a recording told on `/tf`, not `/tf_static`."""
+        self._calibrations: dict[str, Calibration] = {}
+        self._frame_ids: dict[str, str] = {}
+        self._refused: dict[str, str] = {}
+
+    def add_camera_info(self, camera: str, message: Any) -> bool:
+        """Take over a camera's CameraInfo; return whether it says anything new that the rig file leaves open.
+
+        An impossible one is not raised but remembered as the camera's problem, and replaces what was known before:
+        a camera that calls itself uncalibrated must not be used with yesterday's numbers.
+        """
+        entry = self._entry(camera)
+        is_renamed = entry.frame_id is None and self._frame_ids.get(camera) != message.header.frame_id
+        self._frame_ids[camera] = message.header.frame_id
+        is_recalibrated = entry.calibration is None and self._add_calibration(camera, message)
+        return is_renamed or is_recalibrated
+
+    def _add_calibration(self, camera: str, message: Any) -> bool:
+        try:
+            calibration = calibration_from_message(message, camera)
+        except RigError as error:
+            self._calibrations.pop(camera, None)
+            is_new = self._refused.get(camera) != str(error)
+            self._refused[camera] = str(error)
+            return is_new
+        self._refused.pop(camera, None)
+        is_new = self._calibrations.get(camera) != calibration
+        self._calibrations[camera] = calibration
+        return is_new
+
+    def frame_id(self, camera: str) -> str | None:
+        """Return the camera's optical frame: the rig file's, else CameraInfo's, None while neither is known."""
+        return self._entry(camera).frame_id or self._frame_ids.get(camera)
+
+    def problems(self) -> dict[str, str]:
+        """Say for each camera that is not complete what it lacks; empty when the rig can be built."""
+        found = ((name, self._problem(name)) for name in self.layout.names)
+        return {name: problem for name, problem in found if problem is not None}
+
+    def calibration(self, camera: str) -> Calibration | None:
+        """Return the camera's calibration: the rig file's, else CameraInfo's, None while neither is known."""
+        return self._entry(camera).calibration or self._calibrations.get(camera)
+
+    def calibration_problem(self, camera: str) -> str | None:
+        """Say why the camera has no calibration; None when it has one."""
+        if self.calibration(camera) is not None:
+            return None
+        waiting = f"camera {camera}: waiting for camera_info on {self._entry(camera).camera_info_topic}"
+        return self._refused.get(camera, waiting)
+
+    def refusal(self, camera: str) -> str | None:
+        """Say why the camera's last CameraInfo cannot be used; None when it can, or the rig file's is used."""
+        return None if self._entry(camera).calibration else self._refused.get(camera)
+
+    def transform_problem(self, camera: str) -> str | None:
+        """Say why the camera's pose in the base frame is not known; None when it is."""
+        if self.frame_id(camera) is None:
+            topic = self._entry(camera).camera_info_topic
+            return f"camera {camera}: no frame_id in the rig file, waiting for {topic}"
+        try:
+            self.pose(camera)
+        except TransformError as error:
+            return f"camera {camera}: {error}"
+        return None
+
+    def pose(self, camera: str) -> Pose:
+        """Return the camera's pose in the base frame: the rig file's, else the transforms'; TransformError for none."""
+        entry = self._entry(camera)
+        if entry.base_T_camera is not None:
+            return entry.base_T_camera.matrix(f"camera {camera}: base_T_camera")
+        return self.transforms.lookup(self.layout.base_frame, self.frame_id(camera) or "")
+
+    def rig(self, cameras: Collection[str] | None = None) -> Rig:
+        """Build the rig, of these cameras only where they are given.
+
+        RigError or TransformError names the first camera that lacks something.
+        """
+        layout = self.layout if cameras is None else self._layout_of(cameras)
+        for name, problem in self.problems().items():
+            if name in layout.names:
+                raise RigError(problem)
+        return layout.complete(self._calibrations, {name: self.pose(name) for name in layout.names})
+
+    def order_around_vehicle(self) -> None:
+        """Put the layout's cameras in their order around the vehicle; errors as for `rig`."""
+        cameras = tuple(self._entry(camera.name) for camera in self._around_vehicle())
+        self.layout = self.layout.model_copy(update={"cameras": cameras})
+
+    def completed_layout(self) -> RigLayout:
+        """Return the layout with everything that was collected filled in, its cameras ordered around the vehicle."""
+        cameras = tuple(
+            self._entry(camera.name).model_copy(
+                update={
+                    "frame_id": self.frame_id(camera.name),
+                    "calibration": camera.calibration,
+                    "base_T_camera": PoseEntry.from_matrix(camera.base_T_camera),
+                }
+            )
+            for camera in self._around_vehicle()
+        )
+        return self.layout.model_copy(update={"cameras": cameras})
+
+    def _around_vehicle(self) -> list[Camera]:
+        cameras = {camera.name: camera for camera in self.rig().cameras}
+        order = order_around_vehicle({name: camera.base_T_camera for name, camera in cameras.items()})
+        return [cameras[name] for name in order]
+
+    def _layout_of(self, names: Collection[str]) -> RigLayout:
+        """Leave the other cameras out; the first camera stands in for the anchor."""
+        entries = tuple(entry for entry in self.layout.cameras if entry.name in names)
+        anchor = self.layout.anchor if self.layout.anchor in names else None
+        return self.layout.model_copy(update={"cameras": entries, "anchor": anchor})
+
+    def _entry(self, camera: str) -> CameraEntry:
+        return next(entry for entry in self.layout.cameras if entry.name == camera)
+
+    def _problem(self, camera: str) -> str | None:
+        return self.calibration_problem(camera) or self.transform_problem(camera)

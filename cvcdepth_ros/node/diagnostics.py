@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the node says of itself on `/diagnostics`, in diagnostic_updater's form: `node: subject`, level, values."""
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+
+from cvcdepth_core.estimator import DepthEstimator
+from cvcdepth_core.rig_health.overlap_monitor import OverlapMonitor
+from cvcdepth_ros.live.camera_states import CameraCondition, CameraState, CameraWatch
+from cvcdepth_ros.live.mailbox import MailboxStatistics
+from cvcdepth_ros.surround_sets.latencies import StageSummary
+from cvcdepth_ros.surround_sets.synchronizer import CameraStatistics, SynchronizerStatistics
+
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+
+_LEVELS = {
+    CameraState.OK: OK,
+    CameraState.REJECTED: ERROR,
+    CameraState.FROZEN: ERROR,
+    CameraState.STALE: ERROR,
+}
+
+
+def status(level: bytes, subject: str, message: str, values: Mapping[str, Any] | None = None) -> DiagnosticStatus:
+    """Build one status; the node's name is put before `subject` when it is published."""
+    pairs = [KeyValue(key=key, value=_text(value)) for key, value in (values or {}).items()]
+    return DiagnosticStatus(level=level, name=subject, message=message, values=pairs)
+
+
+def camera_status(
+    camera: str, condition: CameraCondition, statistics: CameraStatistics, watch: CameraWatch, lost: int
+) -> DiagnosticStatus:
+    """One camera: its state and why, and how its images fared."""
+    silence = watch.seconds_since_image
+    values = {
+        "state": condition.state.value,
+        "received": statistics.received + watch.repeated,
+        "matched": statistics.matched,
+        "queued": statistics.queued,
+        "sets without it": statistics.missed,
+        "refused": watch.refused,
+        "left out: frozen": watch.repeated,
+        "lost in transport": lost,
+        **{f"dropped: {reason}": count for reason, count in statistics.dropped.items()},
+        "clock steps": statistics.clock_steps,
+        "rate (Hz)": 1e9 / statistics.period_ns if statistics.period_ns else "unknown",
+        "seconds since last image": "never" if silence is None else silence,
+    }
+    return status(_LEVELS.get(condition.state, WARN), f"camera {camera}", condition.text, values)
+
+
+class SynchronisationStatus:
+    """How many sets were matched, what became of them, and whether any got through since the report before."""
+
+    def __init__(self, max_age: float) -> None:
+        """`max_age` in seconds, for the text."""
+        self._max_age = max_age
+        self._before: Counter[str] = Counter()
+
+    def of(
+        self, synchroniser: SynchronizerStatistics, mailbox: MailboxStatistics, counters: Mapping[str, int]
+    ) -> DiagnosticStatus:
+        """Report what these have counted so far."""
+        values = {"matched": synchroniser.sets, **asdict(mailbox), **counters}
+        problem = self._problem(Counter(values))
+        message = f"{synchroniser.sets} sets matched, {counters['published']} published"
+        level = WARN if problem or not synchroniser.sets else OK
+        return status(level, "synchronisation", "; ".join(filter(None, (problem, message))), values)
+
+    def _problem(self, counted: Counter[str]) -> str:
+        new, self._before = counted - self._before, counted
+        if new["stale"] and not new["delivered"]:
+            age = f"max_age ({self._max_age:g} s)"
+            return f"every set is older than {age} in the node's time: do the clocks agree? see use_sim_time"
+        if new["skipped: rig not complete"] and not new["published"]:
+            return "sets are skipped: too few cameras are complete"
+        return ""
+
+
+def inference_status(
+    summaries: Mapping[str, StageSummary], mailbox: MailboxStatistics, problem: str, model_id: str
+) -> DiagnosticStatus:
+    """How long each stage takes, in milliseconds, and how many sets came too late or too early for the network."""
+    values = {
+        f"{stage} {name}": value
+        for stage, summary in summaries.items()
+        for name, value in (("p50 (ms)", summary.p50_ms), ("p95 (ms)", summary.p95_ms), ("max (ms)", summary.max_ms))
+    }
+    misses = {"deadline misses": mailbox.replaced + mailbox.stale}
+    return status(ERROR if problem else OK, "inference", problem or model_id, values | misses)
+
+
+def model_status(estimator: DepthEstimator) -> DiagnosticStatus:
+    """Which network runs, and where."""
+    values = {"device": estimator.device, "height": estimator.spec.height, "width": estimator.spec.width}
+    return status(OK, "model", estimator.model_id, values)
+
+
+def overlap_status(monitor: OverlapMonitor) -> DiagnosticStatus:
+    """How well neighbouring cameras agree, pair by pair, and which of them have changed."""
+    values: dict[str, Any] = {}
+    for (camera, neighbour), pair in monitor.pairs().items():
+        values[f"{camera} - {neighbour}: turned (deg)"] = pair.misalignment
+        values[f"{camera} - {neighbour}: depth differs by"] = pair.disagreement
+        values[f"{camera} - {neighbour}: usually by"] = pair.usual_disagreement
+    values |= {f"{camera}: sharper by (log)": change for camera, change in monitor.sharpness_changes().items()}
+    findings = "; ".join(map(str, monitor.findings()))
+    return status(WARN if findings else OK, "cross-view consistency", findings or "ok", values)
+
+
+def _text(value: Any) -> str:
+    return f"{value:.2f}" if isinstance(value, float) else str(value)

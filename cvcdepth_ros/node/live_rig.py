@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`rig:=auto`: find the cameras of a running system, their calibrations and their poses."""
+
+import time
+from functools import partial
+
+from rclpy.node import Node
+from rclpy.qos import qos_profile_sensor_data
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import CameraInfo
+
+from cvcdepth_core.errors import CvcDepthError
+from cvcdepth_core.rig.rig import CameraEntry, RigLayout
+from cvcdepth_ros.messages.camera_discovery import discover_cameras
+from cvcdepth_ros.messages.rig_assembly import RigAssembler
+from cvcdepth_ros.messages.transforms import TransformTree
+from cvcdepth_ros.node.subscriptions import StaticTransformInput, topic_types
+
+_SETTLING_SECONDS = 3.0
+
+
+class LiveRigDiscovery:
+    """Watches the graph until its cameras stay the same for three seconds and each is calibrated and has a pose."""
+
+    def __init__(self, node: Node, base_frame: str, min_cameras: int) -> None:
+        """Start listening. ConfigError where tf2_msgs is not installed: then nothing tells the cameras' poses."""
+        self._node = node
+        self._base_frame = base_frame
+        self._least = max(2, min_cameras)
+        self._entries: tuple[CameraEntry, ...] = ()
+        self._assembler: RigAssembler | None = None
+        self._subscriptions: list[Subscription] = []
+        self._tree = TransformTree()
+        self._refusal = ""
+        self._transforms = StaticTransformInput(node, self._tree)
+        self._changed = time.monotonic()
+
+    def poll(self) -> RigAssembler | None:
+        """Look at the graph once more; return the rig's assembler when it is complete, its cameras in their order.
+
+        Its layout leaves calibrations and poses open, so that they can change later.
+        """
+        self._watch_graph()
+        settled = time.monotonic() - self._changed > _SETTLING_SECONDS
+        if not settled or self._assembler is None or self._assembler.problems():
+            return None
+        try:
+            self._assembler.order_around_vehicle()
+        except CvcDepthError as error:  # cameras that are each complete but together no rig
+            self.refuse(str(error))
+            return None
+        return self._assembler
+
+    def refuse(self, reason: str) -> None:
+        """Let what was found settle anew, because nothing can be done with it."""
+        self._refusal, self._changed = reason, time.monotonic()
+
+    def problem(self) -> str:
+        """Say what is still missing."""
+        if len(self._entries) < self._least:
+            names = ", ".join(entry.name for entry in self._entries) or "none"
+            want = f"at least {self._least} cameras with image and camera_info topics"
+            return f"rig auto: waiting for {want}, found {names}"
+        problems = self._assembler.problems() if self._assembler else {}
+        return "rig auto: " + next(iter(problems.values()), self._refusal or "waiting for the set of cameras to settle")
+
+    def close(self) -> None:
+        """Drop all subscriptions."""
+        self._transforms.close()
+        self._drop_camera_infos()
+
+    def _watch_graph(self) -> None:
+        # A node's own outputs look like cameras too.
+        own = f"{self._node.get_fully_qualified_name()}/"
+        types = {topic: names[0] for topic, names in topic_types(self._node).items() if not topic.startswith(own)}
+        entries = tuple(discover_cameras(types))
+        if entries == self._entries:
+            return
+        self._entries, self._changed = entries, time.monotonic()
+        self._drop_camera_infos()
+        self._assembler = None
+        if len(entries) >= self._least:
+            self._assembler = RigAssembler(RigLayout(base_frame=self._base_frame, cameras=entries), self._tree)
+            self._subscriptions = [self._subscribe(entry, self._assembler) for entry in entries]
+
+    def _subscribe(self, entry: CameraEntry, assembler: RigAssembler) -> Subscription:
+        callback = partial(assembler.add_camera_info, entry.name)
+        return self._node.create_subscription(
+            CameraInfo, entry.camera_info_topic, lambda message: callback(message), qos_profile_sensor_data
+        )
+
+    def _drop_camera_infos(self) -> None:
+        for subscription in self._subscriptions:
+            self._node.destroy_subscription(subscription)
+        self._subscriptions = []

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node's parameters: one model gives their defaults, descriptions, ranges and checks."""
+
+from collections.abc import Iterable
+from typing import Any, Literal, get_args, get_origin
+
+from pydantic import Field, ValidationError
+from pydantic.fields import FieldInfo
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.node import Node
+
+from cvcdepth_core.errors import ConfigError
+from cvcdepth_core.rig.calibration import first_validation_message
+from cvcdepth_ros.settings import MatchingSettings, MissingCameraSettings, ModelSettings, OutputSettings
+
+AUTO = "auto"
+
+CHANGEABLE_WHILE_RUNNING = ("checkpoint", "cloud_stride", "cloud_min_range", "cloud_max_range", "cloud_voxel")
+
+
+class NodeParameters(OutputSettings, MissingCameraSettings, MatchingSettings, ModelSettings):
+    """Everything that can be set; the docstring of each field is its ROS description."""
+
+    rig: str = ""
+    """Rig file (YAML), or 'auto': find the cameras among the live topics and their poses on /tf_static."""
+    base_frame: str = "base_link"
+    """With rig 'auto': the vehicle's frame. A rig file names its own."""
+    autostart: bool = True
+    """Configure and activate at start; switch off where a lifecycle manager does that."""
+    max_age: float = Field(0.5, ge=0, le=3600)
+    """Seconds (ROS time) after which a waiting set is not worth inference any more; 0 takes any age."""
+    max_image_mb: float = Field(64.0, gt=0, le=2000)
+    """Megabytes above which an image message is refused; queue_size such images are kept per camera at most."""
+    reliable: bool = False
+    """Subscribe images and camera_info reliably instead of with sensor-data QoS."""
+    stale_after: float = Field(1.0, gt=0, le=3600)
+    """Seconds without an image after which a camera counts as stale."""
+    frozen_after: float = Field(1.0, ge=0, le=3600)
+    """Seconds of the very same picture after which a camera counts as frozen and is left out; 0 accepts any."""
+    overlap_monitor: bool = True
+    """Compare neighbouring cameras in their overlaps, to tell of a shifted mount or a dirty lens in /diagnostics."""
+    trace: str = ""
+    """File for a trace of every stage that https://ui.perfetto.dev opens; at most 64 MB."""
+
+    def check_complete(self) -> None:
+        """Raise ConfigError where the parameters are each possible but together not enough to start with."""
+        if not self.rig:
+            raise ConfigError(f"parameter rig is empty: name a rig file, or '{AUTO}'")
+        if self.untrained and self.checkpoint:
+            raise ConfigError(
+                f"parameters checkpoint '{self.checkpoint}' and untrained true: a checkpoint is trained; name none "
+                "to run random weights"
+            )
+
+
+def declare_parameters(node: Node) -> None:
+    """Declare every parameter with its description and range."""
+    for name, field in NodeParameters.model_fields.items():
+        node.declare_parameter(name, field.default, _descriptor(name, field))
+
+
+def read_parameters(node: Node, changed: Iterable[Any] = ()) -> NodeParameters:
+    """Read and check the parameters as they stand, with `changed` (rclpy Parameters) in place of their old values.
+
+    ConfigError names the parameter and the value.
+    """
+    values = {name: node.get_parameter(name).value for name in NodeParameters.model_fields}
+    values |= {parameter.name: parameter.value for parameter in changed if parameter.name in values}
+    try:
+        return NodeParameters.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError(f"parameter {first_validation_message(error)}") from error
+
+
+def _descriptor(name: str, field: FieldInfo) -> ParameterDescriptor:
+    descriptor = ParameterDescriptor(name=name, description=field.description or "")
+    low, high = _limit(field, "ge", "gt"), _limit(field, "le")
+    if low is not None and field.annotation is int:
+        step = _limit(field, "multiple_of") or 0
+        descriptor.integer_range = [IntegerRange(from_value=low, to_value=high, step=step)]
+    elif low is not None:
+        descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
+    if get_origin(field.annotation) is Literal:
+        descriptor.additional_constraints = f"one of {', '.join(get_args(field.annotation))}"
+    return descriptor
+
+
+def _limit(field: FieldInfo, *kinds: str) -> Any:
+    """Return the field's constraint of one of these kinds; None where it has none."""
+    found = [getattr(constraint, kind, None) for constraint in field.metadata for kind in kinds]
+    return next((value for value in found if value is not None), None)

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node's publishers. What nobody subscribes is not computed."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+
+from cvcdepth_core.errors import ConfigError
+from cvcdepth_core.estimator import SurroundDepth
+from cvcdepth_core.pointcloud import CloudLimits
+from cvcdepth_core.rig.rig import Rig
+from cvcdepth_ros.messages.conversion import ros_message_class, ros_message_factory
+from cvcdepth_ros.node.qos import refusing_impossible_qos
+from cvcdepth_ros.surround_sets.latencies import StageLatencies
+from cvcdepth_ros.surround_sets.output_messages import SurroundMessages, camera_topics, output_types
+from cvcdepth_ros.surround_sets.synchronizer import SurroundSet
+
+
+class SurroundOutputs:
+    """Publishes one set's depth, pictures and clouds under the node's private names."""
+
+    def __init__(self, node: Node, cameras: list[str], depth_encoding: str, latencies: StageLatencies) -> None:
+        """Advertise; ConfigError names a topic that cannot be."""
+        self._node = node
+        self._latencies = latencies
+        self._messages = SurroundMessages(ros_message_factory(), depth_encoding)
+        self._publishers: dict[str, Publisher] = {}
+        try:
+            for topic, type_name in output_types(cameras).items():
+                self._publishers[topic] = self._publisher(topic, type_name)
+        except ConfigError:
+            self.close()
+            raise
+
+    def wanted(self, camera: str) -> bool:
+        """Whether anybody subscribes something for which this camera's depth is needed."""
+        return any(map(self._has_subscribers, camera_topics(camera)))
+
+    def publish(
+        self,
+        surround_set: SurroundSet[Any],
+        depth: SurroundDepth,
+        rig: Rig,
+        frame_ids: Mapping[str, str],
+        limits: CloudLimits,
+    ) -> None:
+        """Publish one set; see `SurroundMessages.of_set` for stamps and frames."""
+        with self._latencies.measure("postprocess"):
+            outputs = list(self._messages.of_set(surround_set, depth, rig, frame_ids, limits, self._has_subscribers))
+        with self._latencies.measure("publish"):
+            for output in outputs:
+                self._publishers[output.topic].publish(output.message)
+
+    def close(self) -> None:
+        """Drop all publishers."""
+        for publisher in self._publishers.values():
+            self._node.destroy_publisher(publisher)
+
+    def _has_subscribers(self, topic: str) -> bool:
+        return bool(self._publishers[topic].get_subscription_count())
+
+    def _publisher(self, topic: str, type_name: str) -> Publisher:
+        with refusing_impossible_qos(topic):
+            return self._node.create_publisher(
+                ros_message_class(type_name),
+                f"~/{topic}",
+                # Overrides are written into the profile that is handed over: each publisher needs its own.
+                QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10, reliability=ReliabilityPolicy.RELIABLE),
+                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            )

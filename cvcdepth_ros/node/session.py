@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What runs while the node is active: its topics tied to the pipeline, and what is known of each camera."""
+
+from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.node import Node
+
+from cvcdepth_core.errors import CvcDepthError
+from cvcdepth_core.estimator import DepthEstimator
+from cvcdepth_core.rig.rig import Rig
+from cvcdepth_core.rig_health.overlap_monitor import OverlapMonitor
+from cvcdepth_ros.live.camera_states import CameraCondition, CameraState, CameraWatch, Trouble, condition
+from cvcdepth_ros.live.mailbox import Mailbox
+from cvcdepth_ros.live.picture_preparation import CameraImage
+from cvcdepth_ros.live.pipeline import PublishedSet, SurroundPipeline
+from cvcdepth_ros.messages.conversion import stamp_ns
+from cvcdepth_ros.messages.rig_assembly import RigAssembler
+from cvcdepth_ros.node.diagnostics import (
+    SynchronisationStatus,
+    camera_status,
+    inference_status,
+    model_status,
+    overlap_status,
+)
+from cvcdepth_ros.node.parameters import NodeParameters, read_parameters
+from cvcdepth_ros.node.publishers import SurroundOutputs
+from cvcdepth_ros.node.subscriptions import CameraInputs, StaticTransformInput
+from cvcdepth_ros.surround_sets.latencies import StageLatencies
+from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS, SurroundSynchronizer
+from cvcdepth_ros.surround_sets.trace_file import TraceFile
+
+
+class SurroundSession:
+    """Subscriptions, pipeline and publishers of one active period.
+
+    Callbacks run on the executor's thread and only pass images on; everything heavy is the pipeline's.
+    """
+
+    def __init__(
+        self, node: Node, assembler: RigAssembler, estimator: DepthEstimator, parameters: NodeParameters
+    ) -> None:
+        """Subscribe, advertise and start the threads; ConfigError names a parameter that does not fit the rig.
+
+        `assembler` has the rig's layout, and may have collected some of what that leaves open.
+        """
+        self._node = node
+        self._estimator = estimator
+        self._assembler, layout = assembler, assembler.layout
+        self._places: dict[str, bytes] = {}
+        self._synchroniser: SurroundSynchronizer[CameraImage] = SurroundSynchronizer.of_rig(
+            layout, parameters.tolerance, parameters.queue_size, parameters.min_cameras
+        )
+        self._mailbox: Mailbox[CameraImage] = Mailbox(parameters.max_age or None, self._ros_time)
+        self._watches = {name: CameraWatch(parameters.stale_after, parameters.frozen_after) for name in layout.names}
+        self._overlaps: OverlapMonitor | None = None
+        self._monitored_rig: Rig | None = None
+        self._max_image_mb = parameters.max_image_mb
+        self._offsets_ns = {camera.name: camera.stamp_offset_ns for camera in layout.cameras}
+        self._synchronisation = SynchronisationStatus(parameters.max_age)
+        self._is_finished = False
+        with ExitStack() as opened:
+            trace = None
+            if parameters.trace:
+                trace = opened.enter_context(closing(TraceFile(Path(parameters.trace).expanduser())))
+            self.latencies = StageLatencies(trace)
+            if any(camera.base_T_camera is None for camera in layout.cameras):
+                transforms = StaticTransformInput(node, assembler.transforms, self._on_transforms)
+                opened.enter_context(closing(transforms))
+            outputs = SurroundOutputs(node, layout.names, parameters.depth_encoding, self.latencies)
+            self._outputs = opened.enter_context(closing(outputs))
+            self._pipeline = SurroundPipeline(
+                estimator,
+                self._synchroniser,
+                self._mailbox,
+                self._watches,
+                self._outputs.wanted,
+                self._publish,
+                self._watch_overlaps if parameters.overlap_monitor else lambda _: None,
+                self.latencies,
+            )
+            opened.callback(self._close_pipeline)
+            inputs = CameraInputs(node, layout, parameters.reliable, self._on_image, self._on_camera_info)
+            self._inputs = opened.enter_context(closing(inputs))
+            self._rebuild()
+            self._opened = opened.pop_all()
+
+    def poll(self) -> None:
+        """Subscribe image topics that have appeared."""
+        self._inputs.connect()
+
+    def set_model(self, estimator: DepthEstimator) -> None:
+        """Use another network from the next set on; EngineError when it cannot run."""
+        self._pipeline.set_model(estimator)
+        self._estimator = estimator
+        self._monitored_rig = None  # what was usual for the former network need not be for this one
+
+    def resume_listening(self) -> None:
+        """Hold no silence against the cameras: the executor was busy, and took no image until now."""
+        for watch in self._watches.values():
+            watch.resume_listening()
+
+    def close(self) -> bool:
+        """Stop everything; False when a thread is still busy with its last set a second later."""
+        self._opened.close()
+        return self._is_finished
+
+    def conditions(self) -> dict[str, CameraCondition]:
+        """Say for each camera how it fares."""
+        troubles = {name: self._setup_troubles(name) for name in self._watches}
+        for name, found in self._inputs.troubles().items():
+            troubles[name] += [*found, *self._watches[name].troubles()]
+        statistics = self._synchroniser.statistics().cameras
+        # Cameras that are missing leave all others unmatched when those are too few for a set.
+        are_too_few = sum(not found for found in troubles.values()) < self._synchroniser.required
+        for name, watch in self._watches.items():
+            troubles[name] += watch.unmatched(statistics[name].matched, bool(troubles[name]) or are_too_few)
+        return {name: condition(name, found) for name, found in troubles.items()}
+
+    @property
+    def problem(self) -> str:
+        """Why the last set was refused; empty when it was not."""
+        return self._pipeline.problem
+
+    @property
+    def refused(self) -> int:
+        """Sets that were refused so far."""
+        return self._pipeline.counters["refused"]
+
+    def diagnostics(self) -> list[DiagnosticStatus]:
+        """Describe cameras, synchronisation, inference and model."""
+        statistics, mailbox = self._synchroniser.statistics(), self._mailbox.statistics()
+        cameras = [
+            camera_status(name, found, statistics.cameras[name], self._watches[name], self._inputs.lost[name])
+            for name, found in self.conditions().items()
+        ]
+        return [
+            *cameras,
+            self._synchronisation.of(statistics, mailbox, self._pipeline.counters),
+            inference_status(self.latencies.summaries(), mailbox, self.problem, self._estimator.model_id),
+            model_status(self._estimator),
+            *([overlap_status(self._overlaps)] if self._overlaps else []),
+        ]
+
+    def _setup_troubles(self, camera: str) -> list[Trouble]:
+        """Say what the camera lacks before its images can be used."""
+        assembler, states = self._assembler, CameraState
+        reasons = [
+            (states.REJECTED, assembler.refusal(camera)),
+            (states.REJECTED, self._pipeline.rig_problems.get(camera)),
+            (states.WAITING_FOR_CAMERA_INFO, assembler.calibration_problem(camera)),
+            (states.WAITING_FOR_TRANSFORM, assembler.transform_problem(camera)),
+        ]
+        return [(state, reason) for state, reason in reasons if reason]
+
+    def _close_pipeline(self) -> None:
+        self._is_finished = self._pipeline.close()
+
+    def _on_image(self, camera: str, message: Any) -> None:
+        taken = stamp_ns(message) - self._offsets_ns[camera]
+        self.latencies.record("receive (ROS time)", (self._ros_time() - taken) / NANOSECONDS)
+        megabytes = len(message.data) / 1e6
+        if megabytes > self._max_image_mb:
+            self._watches[camera].used(f"image of {megabytes:.1f} MB, more than max_image_mb ({self._max_image_mb:g})")
+            return
+        self._pipeline.add(camera, message)
+
+    def _on_camera_info(self, camera: str, message: Any) -> None:
+        if self._assembler.add_camera_info(camera, message):
+            self._rebuild()
+
+    def _on_transforms(self) -> None:
+        if self._complete_places() != self._places:
+            self._rebuild()
+
+    def _complete_places(self) -> dict[str, bytes]:
+        """Return where each complete camera is mounted, to be compared."""
+        lacking = self._assembler.problems()
+        return {name: self._assembler.pose(name).tobytes() for name in self._watches if name not in lacking}
+
+    def _rebuild(self) -> None:
+        """Have the rectification maps built anew, or forgotten while too few cameras are complete."""
+        self._places = self._complete_places()
+        enough = len(self._places) >= self._synchroniser.required
+        try:
+            self._pipeline.set_rig(self._assembler.rig(self._places) if enough else None)
+        except CvcDepthError as error:
+            self._pipeline.set_rig(None)
+            self._node.get_logger().error(str(error))
+
+    def _publish(self, published: PublishedSet) -> None:
+        frame_ids = {name: self._assembler.frame_id(name) or "" for name in published.rig.names}
+        limits = read_parameters(self._node).cloud_limits
+        self._outputs.publish(published.images, published.depth, published.rig, frame_ids, limits)
+        age = self._ros_time() - max(published.images.times_ns.values())
+        self.latencies.record("age of newest image at publish (ROS time)", age / 1e9)
+
+    def _watch_overlaps(self, published: PublishedSet) -> None:
+        if self._overlaps is None or self._monitored_rig is not published.rig:
+            self._overlaps, self._monitored_rig = OverlapMonitor(published.rig), published.rig
+        with self.latencies.measure("overlap monitor"):
+            self._overlaps.update(published.depth, published.images.stamp_ns)
+
+    def _ros_time(self) -> int:
+        return int(self._node.get_clock().now().nanoseconds)

@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node's subscriptions: images, camera_info and static transforms, each with what can go wrong on its topic."""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    QoSCompatibility,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_check_compatible,
+)
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+
+from cvcdepth_core.errors import ConfigError, TransformError
+from cvcdepth_core.rig.rig import CameraEntry, RigLayout
+from cvcdepth_ros.live.camera_states import CameraState, Trouble
+from cvcdepth_ros.messages.camera_discovery import COMPRESSED_IMAGE_TYPE, IMAGE_TYPE
+from cvcdepth_ros.messages.transforms import TransformTree
+from cvcdepth_ros.node.qos import SubscriptionEventCallbacks, input_qos, refusing_impossible_qos
+
+_IMAGE_CLASSES = {IMAGE_TYPE: Image, COMPRESSED_IMAGE_TYPE: CompressedImage}
+
+
+def topic_types(node: Node) -> dict[str, list[str]]:
+    """Return the types of every topic in the graph."""
+    return dict(node.get_topic_names_and_types())
+
+
+class CameraInputs:
+    """Subscribes each camera's topics, images as soon as the graph tells whether they are raw or compressed."""
+
+    def __init__(
+        self,
+        node: Node,
+        layout: RigLayout,
+        reliable: bool,
+        on_image: Callable[[str, Any], None],
+        on_camera_info: Callable[[str, Any], None],
+    ) -> None:
+        """Both callbacks get the camera's name first; they run on the executor's thread and must be short.
+
+        ConfigError names a camera_info topic that cannot be subscribed.
+        """
+        self._node = node
+        self._cameras: dict[str, _CameraInput] = {}
+        try:
+            for camera in layout.cameras:
+                callbacks = partial(on_image, camera.name), partial(on_camera_info, camera.name)
+                self._cameras[camera.name] = _CameraInput(node, camera, reliable, *callbacks)
+        except ConfigError:
+            self.close()
+            raise
+
+    @property
+    def lost(self) -> dict[str, int]:
+        """Messages that the middleware lost, by camera."""
+        return {name: camera.lost for name, camera in self._cameras.items()}
+
+    def connect(self) -> None:
+        """Subscribe the image topics that have appeared since the last call."""
+        types = topic_types(self._node)
+        for camera in self._cameras.values():
+            camera.connect(types)
+
+    def troubles(self) -> dict[str, list[Trouble]]:
+        """Say for each camera why no image can arrive."""
+        types = topic_types(self._node)
+        return {name: camera.troubles(types) for name, camera in self._cameras.items()}
+
+    def close(self) -> None:
+        """Drop all subscriptions."""
+        for camera in self._cameras.values():
+            camera.close()
+
+
+class _CameraInput:
+    """One camera's subscriptions."""
+
+    def __init__(
+        self,
+        node: Node,
+        camera: CameraEntry,
+        reliable: bool,
+        on_image: Callable[[Any], None],
+        on_camera_info: Callable[[Any], None],
+    ) -> None:
+        self._node = node
+        self._camera = camera
+        self._reliable = reliable
+        self._on_image = on_image
+        self._image_topic = _resolved(node, camera.image_topic)
+        self._refusal = ""
+        self.lost = 0
+        self._images: Subscription | None = None
+        self._camera_info = self._subscribe(CameraInfo, camera.camera_info_topic, on_camera_info)
+
+    def connect(self, types: Mapping[str, Sequence[str]]) -> None:
+        """Subscribe the images if their topic is there and has been tried neither with success nor without."""
+        known = [_IMAGE_CLASSES[name] for name in types.get(self._image_topic, ()) if name in _IMAGE_CLASSES]
+        if known and self._images is None and not self._refusal:
+            try:
+                self._images = self._subscribe(known[0], self._camera.image_topic, self._on_image)
+            except ConfigError as error:
+                self._refusal = str(error)
+
+    def troubles(self, types: Mapping[str, Sequence[str]]) -> list[Trouble]:
+        """Say why no image can arrive."""
+        subscriptions = filter(None, (self._camera_info, self._images))
+        mismatches = filter(None, map(self._qos_mismatch, subscriptions))
+        return [*self._image_troubles(types), *((CameraState.REJECTED, mismatch) for mismatch in mismatches)]
+
+    def close(self) -> None:
+        for subscription in filter(None, (self._camera_info, self._images)):
+            self._node.destroy_subscription(subscription)
+
+    def _image_troubles(self, types: Mapping[str, Sequence[str]]) -> list[Trouble]:
+        topic = self._image_topic
+        if not self._node.count_publishers(topic):
+            return [(CameraState.WAITING_FOR_IMAGES, f"no publisher on {topic}")]
+        if self._refusal:
+            return [(CameraState.REJECTED, self._refusal)]
+        if self._images is None:
+            unusable = f"{topic} carries {', '.join(types.get(topic, ()))}, want {' or '.join(_IMAGE_CLASSES)}"
+            return [(CameraState.REJECTED, unusable)]
+        return []
+
+    def _qos_mismatch(self, subscription: Subscription) -> str:
+        """Compare with every publisher's QoS in the graph: rclpy's event for it was seen not to come."""
+        topic = subscription.topic_name
+        for publisher in self._node.get_publishers_info_by_topic(topic):
+            compatibility, reason = qos_check_compatible(publisher.qos_profile, subscription.qos_profile)
+            if compatibility == QoSCompatibility.ERROR:
+                return f"{topic}: QoS does not match: {reason} See the parameters reliable and qos_overrides."
+        return ""
+
+    def _subscribe(self, message_class: type, topic: str, callback: Callable[[Any], None]) -> Subscription:
+        def message_lost(event: Any) -> None:
+            self.lost += event.total_count_change
+
+        with refusing_impossible_qos(topic):
+            return self._node.create_subscription(
+                message_class,
+                topic,
+                callback,
+                # Overrides are written into the profile that is handed over: each subscription needs its own.
+                input_qos(self._reliable),
+                event_callbacks=SubscriptionEventCallbacks(message_lost=message_lost),
+                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            )
+
+
+def _resolved(node: Node, topic: str) -> str:
+    """Return the name by which the graph knows a topic: whole, and after remapping."""
+    try:
+        return str(node.resolve_topic_name(topic))
+    except RuntimeError as error:  # rclpy's RCLError, which has no public name
+        raise ConfigError(f"image_topic '{topic}': {error}") from error
+
+
+class StaticTransformInput:
+    """Subscribes `/tf_static`. Where tf2_msgs is not installed (the wheels lack it), building it is a ConfigError."""
+
+    def __init__(self, node: Node, tree: TransformTree, on_change: Callable[[], None] = lambda: None) -> None:
+        """Add to `tree` all that fits into it, tell the rest in the log, and call `on_change` after each message."""
+        try:
+            from tf2_msgs.msg import TFMessage
+        except ImportError as error:
+            raise ConfigError(
+                "the rig file leaves base_T_camera to /tf_static, but tf2_msgs is not installed here; "
+                "write a complete rig file with: bag_replay rig BAG -o rig.yaml"
+            ) from error
+        self._node, self._tree, self._on_change = node, tree, on_change
+        qos = QoSProfile(
+            history=HistoryPolicy.KEEP_LAST,
+            depth=100,
+            reliability=ReliabilityPolicy.RELIABLE,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL,
+        )
+        self._subscription = node.create_subscription(TFMessage, "/tf_static", self._on_message, qos)
+
+    def close(self) -> None:
+        """Drop the subscription."""
+        self._node.destroy_subscription(self._subscription)
+
+    def _on_message(self, message: Any) -> None:
+        try:
+            self._tree.add_message(message)
+        except TransformError as error:
+            self._node.get_logger().error(f"/tf_static: {error}", throttle_duration_sec=5.0)
+        self._on_change()

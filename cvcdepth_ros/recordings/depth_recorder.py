@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recording of depth: the topics that the node would have published, and transforms to show them. No ROS here."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from cvcdepth_core.errors import TransformError
+from cvcdepth_core.rig.poses import Pose
+from cvcdepth_ros.bags import RecordedMessage, RecordingWriter
+from cvcdepth_ros.messages.conversion import bag_message_factory
+from cvcdepth_ros.messages.transforms import TransformTree, frame_name
+from cvcdepth_ros.recordings.replay import EstimatedSet, Handlers, SurroundReplay
+from cvcdepth_ros.recordings.rig import STATIC_TRANSFORMS
+from cvcdepth_ros.settings import OutputSettings
+from cvcdepth_ros.surround_sets.output_messages import (
+    MERGED_CAMERAS,
+    MERGED_CLOUD,
+    POINT_CLOUD_TYPE,
+    SurroundMessages,
+    output_types,
+)
+
+CloudChoice = Literal["merged", "all", "none"]
+
+TRANSFORMS = "/tf"
+_NODE = "/surround_depth"
+_TRANSFORM_TYPE = "tf2_msgs/msg/TFMessage"
+_SAME_POSE = 1e-6  # metres, and elements of the rotation
+
+
+class DepthRecorder:
+    """Writes a new rosbag2 folder with the depth of a replayed recording; use it as a context manager.
+
+    Everything lies at the log time of the image that it comes from, so that both recordings can be shown together.
+    """
+
+    def __init__(
+        self, path: Path, replay: SurroundReplay, settings: OutputSettings, clouds: CloudChoice, start: int
+    ) -> None:
+        """Create the folder, announce the topics and write the fixed transforms at the log time `start` (ns).
+
+        Raises RecordingError when the folder exists already, and TransformError when the rig file's poses do not go
+        together with the recording's frames.
+        """
+        self._replay = replay
+        self._settings = settings
+        self._messages = SurroundMessages(bag_message_factory(), settings.depth_encoding)
+        types = output_types(replay.layout.names)
+        self._topics = {topic: type_ for topic, type_ in types.items() if _is_wanted(topic, type_, clouds)}
+        static_transforms = self._static_transforms(start)
+        self._writer = RecordingWriter(path)
+        for topic, type_ in self._topics.items():
+            self._writer.add_topic(f"{_NODE}/{topic}", type_)
+        self._writer.add_topic(STATIC_TRANSFORMS, _TRANSFORM_TYPE)
+        self._writer.write(STATIC_TRANSFORMS, start, static_transforms)
+        self.handlers = self._moving_transforms()
+        """What to do with the replayed recording's other topics: `/tf` is copied."""
+
+    def __enter__(self) -> "DepthRecorder":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._writer.close()
+
+    def write(self, estimated: EstimatedSet) -> None:
+        """Write one set."""
+        images, limits, frame_ids = estimated.images, self._settings.cloud_limits, self._replay.frame_ids
+        for output in self._messages.of_set(
+            images, estimated.depth, estimated.rig, frame_ids, limits, self._topics.__contains__
+        ):
+            self._writer.write(f"{_NODE}/{output.topic}", images.images[output.camera].log_time, output.message)
+
+    def _moving_transforms(self) -> Handlers:
+        moving = self._replay.recording.topics.get(TRANSFORMS)
+        if moving is None or moving.type != _TRANSFORM_TYPE:
+            return {}
+        self._writer.add_topic(TRANSFORMS, _TRANSFORM_TYPE, moving.qos or ())
+        return {TRANSFORMS: self._copy}
+
+    def _copy(self, message: RecordedMessage) -> None:
+        self._writer.write(message.topic, message.log_time, message.cdr)
+
+    def _static_transforms(self, log_time: int) -> Any:
+        """Join all fixed transforms to one message: of a latched topic, players and viewers keep the last alone."""
+        links = {frame_name(link.child_frame_id): link for link in self._recorded_links()}
+        given = bag_message_factory().static_transforms(log_time, self._replay.layout.base_frame, self._given_poses())
+        for link in given.transforms:
+            links[frame_name(link.child_frame_id)] = link
+        given.transforms = list(links.values())
+        TransformTree().add_message(given)  # refuses what is no tree
+        return given
+
+    def _recorded_links(self) -> Iterator[Any]:
+        recording = self._replay.recording
+        if STATIC_TRANSFORMS in recording.topics:
+            for message in recording.messages([STATIC_TRANSFORMS]):
+                yield from recording.deserialize(message).transforms
+
+    def _given_poses(self) -> dict[str, Pose]:
+        """Return the rig file's camera poses that the recording lacks or contradicts, by frame."""
+        frame_ids, base_frame = self._replay.frame_ids, self._replay.layout.base_frame
+        poses = {frame_ids[camera.name]: camera.base_T_camera for camera in self._replay.rig.cameras}
+        return {frame: pose for frame, pose in poses.items() if not self._is_recorded(base_frame, frame, pose)}
+
+    def _is_recorded(self, base_frame: str, frame: str, pose: Pose) -> bool:
+        try:
+            return np.allclose(self._replay.transforms.lookup(base_frame, frame), pose, atol=_SAME_POSE)
+        except TransformError:
+            return False
+
+
+def _is_wanted(topic: str, type_: str, clouds: CloudChoice) -> bool:
+    if topic in (MERGED_CLOUD, MERGED_CAMERAS):
+        return clouds != "none"
+    return type_ != POINT_CLOUD_TYPE or clouds == "all"

@@ -1,0 +1,241 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recording's surround sets and their depth, through the node's own matching, preprocessing and estimator.
+
+No ROS here. `SurroundReplay` gives the sets (for training, say), `DepthReplay` adds the depth. Every set is given:
+there is no clock to keep up with, hence no mailbox.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cvcdepth_core.errors import CvcDepthError, RecordingError, RigError
+from cvcdepth_core.estimator import DepthPredictor, SurroundDepth, SurroundDepthEstimator
+from cvcdepth_core.rig.rig import Rig, RigLayout
+from cvcdepth_ros.bags import RecordedMessage, Recording
+from cvcdepth_ros.messages.conversion import stamp_ns
+from cvcdepth_ros.messages.transforms import TransformTree
+from cvcdepth_ros.recordings.rig import add_camera_info, assemble_rig
+from cvcdepth_ros.settings import MatchingSettings
+from cvcdepth_ros.surround_sets.latencies import StageLatencies
+from cvcdepth_ros.surround_sets.set_estimation import estimate_set
+from cvcdepth_ros.surround_sets.synchronizer import (
+    NANOSECONDS,
+    SurroundSet,
+    SurroundSynchronizer,
+    SynchronizerStatistics,
+)
+
+Handlers = Mapping[str, Callable[[RecordedMessage], None]]
+
+_KEPT_REASONS = 100
+_IMAGES_TO_EXPLAIN = 1000
+
+
+class RecordedImage(NamedTuple):
+    """An image message and when it was recorded (ns)."""
+
+    message: Any
+    log_time: int
+
+
+class Refusals:
+    """Messages and sets that could not be used: how many, and the first hundred reasons."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.reasons: list[str] = []
+
+    def add(self, reason: str) -> None:
+        """Count one more."""
+        self.count += 1
+        if len(self.reasons) < _KEPT_REASONS:
+            self.reasons.append(reason)
+
+    def __str__(self) -> str:
+        return f"{self.count} refused, the first: {self.reasons[0]}" if self.count else "none refused"
+
+
+class SurroundReplay:
+    """The surround sets of a recording, matched as the live node would match them."""
+
+    def __init__(
+        self, recording: Recording, layout: RigLayout, matching: MatchingSettings, min_cameras: int = 0
+    ) -> None:
+        """Complete the rig; RecordingError, RigError or TransformError names the first thing that is missing.
+
+        `min_cameras` below the rig's number gives sets that lack the images of dead cameras; 0 gives only whole ones.
+        """
+        self.recording = recording
+        self.layout = layout
+        self.unreadable = Refusals()
+        """Images and CameraInfo whose bytes are no such message."""
+        self._assembler = assemble_rig(recording, layout)
+        self._rig: Rig | RigError = self._assembler.rig()
+        self._tolerance = matching.tolerance
+        self._synchroniser: SurroundSynchronizer[RecordedImage] = SurroundSynchronizer.of_rig(
+            layout, matching.tolerance, matching.queue_size, min_cameras
+        )
+
+    @property
+    def rig(self) -> Rig:
+        """The rig as of the last set: a new one whenever a CameraInfo changes; RigError while one is impossible."""
+        if isinstance(self._rig, RigError):
+            raise self._rig
+        return self._rig
+
+    @property
+    def required(self) -> int:
+        """Images without which there is no set."""
+        return self._synchroniser.required
+
+    @property
+    def frame_ids(self) -> dict[str, str]:
+        """Each camera's optical frame."""
+        return {name: self._assembler.frame_id(name) or "" for name in self.layout.names}
+
+    @property
+    def transforms(self) -> TransformTree:
+        """The fixed transforms of the recording."""
+        return self._assembler.transforms
+
+    @property
+    def statistics(self) -> SynchronizerStatistics:
+        """What became of the images so far."""
+        return self._synchroniser.statistics()
+
+    def sets(
+        self, start: int | None = None, stop: int | None = None, handlers: Handlers | None = None
+    ) -> Iterator[SurroundSet[RecordedImage]]:
+        """Give the sets of the messages with start <= log_time < stop (ns), in order.
+
+        `handlers` are given the messages of further topics in between, at their time; topics that are not in the
+        recording are passed over.
+        """
+        cameras = {camera.image_topic: camera.name for camera in self.layout.cameras}
+        infos = {camera.camera_info_topic for camera in self.layout.cameras}
+        handlers = handlers or {}
+        topics = {*cameras, *infos, *handlers} & self.recording.topics.keys()
+        for message in self.recording.messages(topics, start, stop):
+            if message.topic in cameras:
+                yield from self._add_image(cameras[message.topic], message)
+            if message.topic in infos:
+                self._add_camera_info(message)
+            if message.topic in handlers:
+                handlers[message.topic](message)
+        yield from self._synchroniser.flush()
+
+    def why_no_set(self, start: int | None = None, stop: int | None = None) -> str:
+        """Explain why `sets` gave none: which cameras are silent, or too far apart for the tolerance."""
+        silent = [name for name, camera in self.statistics.cameras.items() if not camera.received]
+        if silent:
+            return f"no image of camera {', '.join(silent)}"
+        offsets = self._firing_offsets(start, stop)
+        first, last = min(offsets, key=offsets.__getitem__), max(offsets, key=offsets.__getitem__)
+        apart = offsets[last] - offsets[first]
+        return f"images of {first} and {last} are {apart:.3f} s apart, the tolerance is {self._tolerance:g} s"
+
+    def _firing_offsets(self, start: int | None, stop: int | None) -> dict[str, float]:
+        """Median seconds by which each camera's nearest image is later than the anchor's, stamp offsets subtracted."""
+        cameras = {camera.image_topic: camera for camera in self.layout.cameras}
+        stamps: dict[str, list[float]] = {name: [] for name in self.layout.names}
+        for message in islice(self.recording.messages(cameras, start, stop), _IMAGES_TO_EXPLAIN):
+            camera = cameras[message.topic]
+            with suppress(RecordingError):
+                stamp = stamp_ns(self.recording.deserialize(message)) / NANOSECONDS
+                stamps[camera.name].append(stamp - camera.stamp_offset)
+        anchor = np.array(stamps[self.layout.anchor_camera])
+        return {name: _median_distance(anchor, np.array(found)) for name, found in stamps.items()}
+
+    def _add_image(self, camera: str, message: RecordedMessage) -> list[SurroundSet[RecordedImage]]:
+        try:
+            image = self.recording.deserialize(message)
+        except RecordingError as error:
+            self.unreadable.add(f"camera {camera}: {error}")
+            return []
+        return self._synchroniser.add(camera, stamp_ns(image), RecordedImage(image, message.log_time))
+
+    def _add_camera_info(self, message: RecordedMessage) -> None:
+        try:
+            info = self.recording.deserialize(message)
+        except RecordingError as error:
+            self.unreadable.add(str(error))
+            return
+        if add_camera_info(self._assembler, message.topic, info):
+            try:
+                self._rig = self._assembler.rig()
+            except RigError as error:
+                self._rig = error
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatedSet:
+    """One set with its depth."""
+
+    images: SurroundSet[RecordedImage]
+    rig: Rig
+    depth: SurroundDepth
+
+
+class DepthReplay:
+    """Estimates every set of a replay. A set that cannot be estimated is left out and told in `refused`."""
+
+    def __init__(
+        self, replay: SurroundReplay, estimator: DepthPredictor, latencies: StageLatencies | None = None
+    ) -> None:
+        """Prepare for the replay's rig; RigError names a mask that does not fit."""
+        self.refused = Refusals()
+        self.latencies = latencies or StageLatencies()
+        self.estimator = estimator
+        self._replay = replay
+        self._surround = SurroundDepthEstimator(replay.rig, estimator)
+
+    def sets(
+        self,
+        start: int | None = None,
+        stop: int | None = None,
+        handlers: Handlers | None = None,
+        stamp_ns: int | None = None,
+    ) -> Iterator[EstimatedSet]:
+        """Give the sets of `SurroundReplay.sets` with their depth; with a stamp, the set of that stamp only."""
+        for images in self._replay.sets(start, stop, handlers):
+            if stamp_ns not in (None, images.stamp_ns):
+                continue
+            try:
+                surround = self._current_surround()
+                messages = {name: image.message for name, image in images.images.items()}
+                depth = estimate_set(messages, surround, self.latencies, self._replay.required)
+            except CvcDepthError as error:
+                self.refused.add(f"set at {images.stamp_ns} ns: {error}")
+            else:
+                yield EstimatedSet(images, surround.rig, depth)
+
+    def why_no_set(self, start: int | None = None, stop: int | None = None) -> str:
+        """Explain why `sets` gave none: what was refused, else what `SurroundReplay.why_no_set` says."""
+        for refusals in (self.refused, self._replay.unreadable):
+            if refusals.count:
+                return str(refusals)
+        return self._replay.why_no_set(start, stop)
+
+    def _current_surround(self) -> SurroundDepthEstimator:
+        if self._surround.rig is not self._replay.rig:
+            self._surround = SurroundDepthEstimator(self._replay.rig, self.estimator, self._surround)
+        return self._surround
+
+
+def _median_distance(anchor: NDArray[np.float64], stamps: NDArray[np.float64]) -> float:
+    """Median over the anchor's stamps [n] of the signed distance to the nearest of `stamps` [m].
+
+    As for the synchroniser, a later stamp counts its distance 1.25 times.
+    """
+    if not anchor.size or not stamps.size:
+        return math.inf
+    distances = stamps[None, :] - anchor[:, None]
+    nearest = np.where(distances > 0, 1.25 * distances, -distances).argmin(axis=1)
+    return float(np.median(np.take_along_axis(distances, nearest[:, None], axis=1)))

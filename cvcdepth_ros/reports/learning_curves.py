@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The learning curves of a run, from its log."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from cvcdepth_ros.reports.evaluation_figures import BLUE, GREEN, RED, TEXT, YELLOW, add_legend, dark_figure, to_png
+
+_SMOOTHED_OVER = 50  # parts of the run: a point of the curve is the mean of one
+_COLOURS = (YELLOW, RED, GREEN, "#c792ea", "#f78c6c", "#89ddff", "#b0bec5")
+
+
+class RunLog(NamedTuple):
+    """What a run has written down."""
+
+    steps: list[dict[str, Any]]
+    validations: list[dict[str, Any]]
+
+    @classmethod
+    def read(cls, path: Path) -> RunLog:
+        """Read `log.jsonl`; nothing where there is none."""
+        lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+        entries = [json.loads(line) for line in lines]
+        return cls([e for e in entries if "loss" in e], [e for e in entries if "validation" in e])
+
+
+def loss_curves(log: RunLog) -> bytes:
+    """Draw the loss and its unweighted terms over the steps, as PNG."""
+    figure, (loss, terms) = dark_figure(13, 5.2, rows=2)
+    _curve(loss, log.steps, lambda entry: float(entry["loss"]), BLUE, "loss")
+    names = dict.fromkeys(name for entry in log.steps for name in entry["terms"])
+    for name, colour in zip(names, _COLOURS, strict=False):
+        _curve(terms, log.steps, _term(name), colour, name)
+    terms.set_yscale("log")
+    terms.tick_params(which="both", colors=TEXT)
+    _title(loss, "loss")
+    _title(terms, "its terms, without their weights")
+    add_legend(terms)
+    terms.set_xlabel("step", color=TEXT)
+    return to_png(figure)
+
+
+def held_out_curves(log: RunLog) -> bytes:
+    """Draw the scores of the validations over the steps, as PNG."""
+    figure, (score, others) = dark_figure(13, 5.2, rows=2)
+    _points(score, log.validations, "score", BLUE)
+    for name, colour in (("spatial_photometric", YELLOW), ("temporal_photometric", GREEN), ("spatial", RED)):
+        _points(others, log.validations, name, colour)
+    _title(score, "score that weights are chosen by, on some held-out sets (lower is better)")
+    _title(others, "label-free scores")
+    add_legend(others)
+    others.set_xlabel("step", color=TEXT)
+    return to_png(figure)
+
+
+def _term(name: str) -> Callable[[Mapping[str, Any]], float]:
+    return lambda entry: float(entry["terms"].get(name, np.nan))
+
+
+def _curve(
+    axes: Axes,
+    entries: Sequence[Mapping[str, Any]],
+    value: Callable[[Mapping[str, Any]], float],
+    colour: str,
+    name: str,
+) -> None:
+    """Draw means over parts of the run, over the single values where these are as many as the eye can tell apart."""
+    steps = np.array([entry["step"] for entry in entries], dtype=float)
+    values = np.array([value(entry) for entry in entries])
+    finite = np.isfinite(values)
+    steps, values = steps[finite], values[finite]
+    if not len(values):
+        return
+    parts = min(_SMOOTHED_OVER, len(values))
+    means = [part.mean() for part in np.array_split(values, parts)]
+    axes.plot(steps, values, color=colour, linewidth=0.5, alpha=0.35)
+    axes.plot([part.mean() for part in np.array_split(steps, parts)], means, color=colour, linewidth=1.6, label=name)
+
+
+def _points(axes: Axes, entries: Sequence[Mapping[str, Any]], name: str, colour: str) -> None:
+    known = [(entry["step"], entry["validation"][name]) for entry in entries if name in entry["validation"]]
+    if known:
+        axes.plot(*zip(*known, strict=True), color=colour, linewidth=1.4, marker="o", markersize=4, label=name)
+
+
+def _title(axes: Axes, text: str) -> None:
+    axes.set_title(text, loc="left", color=TEXT, fontsize=11)

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From the image messages of one set to depth, for the bag tool and the evaluation, and the live node's part of it."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from cvcdepth_core.errors import ImageError
+from cvcdepth_core.estimator import SurroundDepth, SurroundDepthEstimator
+from cvcdepth_core.images.decoding import Picture
+from cvcdepth_core.images.rectifier import Rectifier
+from cvcdepth_ros.messages.conversion import picture_from_message
+from cvcdepth_ros.surround_sets.latencies import StageLatencies
+
+Outcome = Picture | ImageError
+"""What became of an image: the network's picture, or why there is none."""
+
+
+def estimate_set(
+    messages: Mapping[str, Any], surround: SurroundDepthEstimator, latencies: StageLatencies, required: int
+) -> SurroundDepth:
+    """Decode, rectify and estimate the image messages of one set, by camera; those that are damaged are left out.
+
+    ImageError says what is wrong with them when fewer than `required` images are left.
+    """
+    rectifiers = surround.preprocessor.rectifiers
+    outcomes = {
+        name: picture_or_error(messages[name], name, rectifier, latencies)
+        for name, rectifier in rectifiers.items()
+        if name in messages
+    }
+    pictures = usable_pictures(outcomes, len(messages), required)
+    with latencies.measure("inference"):
+        return surround.estimate([pictures.get(name) for name in rectifiers])
+
+
+def usable_pictures(outcomes: Mapping[str, Outcome], cameras: int, required: int) -> dict[str, Picture]:
+    """Return the pictures that were made; ImageError when the others leave fewer than `required` of `cameras`."""
+    damaged = [str(outcome) for outcome in outcomes.values() if isinstance(outcome, ImageError)]
+    if cameras - len(damaged) < required:
+        raise ImageError("; ".join(damaged) or f"{cameras} calibrated cameras are fewer than {required}")
+    return {name: outcome for name, outcome in outcomes.items() if not isinstance(outcome, ImageError)}
+
+
+def picture_or_error(message: Any, camera: str, rectifier: Rectifier, latencies: StageLatencies) -> Outcome:
+    """Take one image message to the network's picture.
+
+    The error names the camera whose image is damaged, of an unknown encoding, or not of the calibration's size.
+    """
+    try:
+        with latencies.measure("decode"):
+            picture = picture_from_message(message, camera, rectifier.reduction, rectifier.image_size)
+        with latencies.measure("preprocess"):
+            return rectifier(picture, camera, rectifier.reduction)
+    except ImageError as error:
+        return error
+    except Exception as error:  # what OpenCV raises has no end, and one image must not cost the others of its set
+        return ImageError(f"camera {camera}: {type(error).__name__}: {error}")

@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`bag_replay rig`: the rig file of a recording."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import recordings
+from recordings import CAMERAS, JAZZY, SAMPLE
+
+from cvcdepth_core.rig.rig import load_rig_layout
+from cvcdepth_ros.bag_replay import main
+
+
+def write_rig(recording: Path, output: Path, *options: str) -> Path:
+    assert main(["rig", str(recording), "-o", str(output), *options]) == 0
+    return output
+
+
+def refusal(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], *options: str) -> str:
+    """What the program says; it must be one line, and no rig file may be left."""
+    output = tmp_path / "refused.yaml"
+    assert main(["rig", str(recording), "-o", str(output), *options]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert not output.exists()
+    return line
+
+
+def test_the_cameras_are_ordered_around_the_vehicle_from_the_front_one(tmp_path: Path):
+    layout = load_rig_layout(write_rig(SAMPLE, tmp_path / "rig.yaml"))
+    assert tuple(layout.names) == CAMERAS
+    assert layout.anchor == "front"
+    assert layout.base_frame == "base_link"
+
+
+def test_neighbours_and_overlap_angles_are_those_of_the_vehicle(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    write_rig(SAMPLE, tmp_path / "rig.yaml", "--json")
+    result = json.loads(capsys.readouterr().out)
+    degrees = {(o["camera"], o["neighbour"]): o["degrees"] for o in result["overlaps"] if o["are_neighbours"]}
+    expected = {
+        ("front", "front_left"): 14,
+        ("front", "front_right"): 14,
+        ("front_left", "left"): 58,
+        ("left", "back"): 4,
+    }
+    for (camera, neighbour), angle in expected.items():
+        assert degrees[camera, neighbour] == pytest.approx(angle, abs=1)
+        assert degrees[neighbour, camera] == pytest.approx(angle, abs=1)
+    assert ("back", "right") not in degrees
+    views = {camera["name"]: camera["horizontal_view_degrees"] for camera in result["cameras"]}
+    assert views == pytest.approx(dict.fromkeys(CAMERAS, 92) | {"front": 52}, abs=0.6)
+
+
+def test_the_rig_file_alone_is_a_complete_rig(tmp_path: Path):
+    rig = load_rig_layout(write_rig(SAMPLE, tmp_path / "rig.yaml")).complete()
+    (static,) = (e for e in recordings.sample_entries(1) if e.topic == "/tf_static")
+    message: Any = JAZZY.deserialize_cdr(static.cdr, static.type)
+    recorded = {link.child_frame_id: link.transform.translation for link in message.transforms}
+    for camera in rig.cameras:
+        t = recorded[f"{camera.name}_camera_optical_frame"]
+        np.testing.assert_allclose(camera.base_T_camera[:3, 3], [t.x, t.y, t.z], atol=1e-12)
+
+
+def test_the_file_says_where_it_comes_from_and_which_cameras_overlap(tmp_path: Path):
+    text = write_rig(SAMPLE, tmp_path / "rig.yaml").read_text()
+    comment = [line for line in text.splitlines() if line.startswith("#")]
+    assert "pandaset_002_excerpt" in comment[0]
+    assert any("left - back: 4." in line for line in comment)
+
+
+def test_every_storage_gives_the_same_rig(tmp_path: Path):
+    expected = load_rig_layout(write_rig(SAMPLE, tmp_path / "expected.yaml"))
+    copies = [recordings.sqlite_copy(tmp_path / "sqlite", 1), recordings.ros1_copy(tmp_path / "ros1.bag", 1)]
+    for copy in copies:
+        assert load_rig_layout(write_rig(copy, tmp_path / f"{copy.stem}.yaml")) == expected
+
+
+def test_a_rig_file_is_only_overwritten_by_force(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    existing = tmp_path / "rig.yaml"
+    existing.write_text("precious")
+    assert main(["rig", str(SAMPLE), "-o", str(existing)]) == 1
+    assert "exists already" in capsys.readouterr().err
+    assert existing.read_text() == "precious"
+    write_rig(SAMPLE, existing, "--force")
+    assert load_rig_layout(existing).names
+
+
+def test_a_mask_made_by_hand_is_only_overwritten_by_force(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    mask = tmp_path / "refused_masks" / "back.png"
+    mask.parent.mkdir()
+    mask.write_bytes(b"made by hand")
+    assert "back.png: exists already; --force overwrites it" in refusal(SAMPLE, tmp_path, capsys, "--masks")
+    assert mask.read_bytes() == b"made by hand"
+    write_rig(SAMPLE, tmp_path / "refused.yaml", "--masks", "--force")
+    assert mask.read_bytes().startswith(b"\x89PNG")
+
+
+def test_cameras_of_which_none_sees_ground_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    def look_up(message: Any) -> None:
+        for link in message.transforms:
+            q = link.transform.rotation
+            q.x, q.y, q.z, q.w = 0.0, 0.0, 0.0, 1.0  # as a body frame: z up
+
+    entries = recordings.changed(recordings.sample_entries(), "/tf_static", look_up)
+    body = recordings.write_rosbag2(tmp_path / "body", entries)
+    line = refusal(body, tmp_path, capsys, "--masks", "--anchor", "front")
+    assert f"camera {', '.join(sorted(CAMERAS))}: none sees ground" in line
+
+
+def test_the_anchor_can_be_chosen_among_the_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert load_rig_layout(write_rig(SAMPLE, tmp_path / "rig.yaml", "--anchor", "back")).anchor == "back"
+    capsys.readouterr()
+    assert "no camera is called top" in refusal(SAMPLE, tmp_path, capsys, "--anchor", "top")
+
+
+def test_a_recording_without_cameras_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    entries = [entry for entry in recordings.sample_entries(1) if not entry.topic.startswith("/camera")]
+    line = refusal(recordings.write_rosbag2(tmp_path / "no_cameras", entries), tmp_path, capsys)
+    assert "no_cameras" in line
+    assert "found 0" in line
+
+
+def test_an_uncalibrated_camera_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    def uncalibrate(message: Any) -> None:
+        message.k = np.zeros(9)
+
+    entries = recordings.changed(recordings.sample_entries(1), "/camera/left/camera_info", uncalibrate)
+    line = refusal(recordings.write_rosbag2(tmp_path / "uncalibrated", entries), tmp_path, capsys)
+    assert "camera left" in line
+    assert "K[0] = 0" in line
+
+
+def test_an_unknown_distortion_model_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    def unknown(message: Any) -> None:
+        message.distortion_model = "double_sphere"
+
+    entries = recordings.changed(recordings.sample_entries(1), "/camera/back/camera_info", unknown)
+    line = refusal(recordings.write_rosbag2(tmp_path / "unknown", entries), tmp_path, capsys)
+    assert "camera back" in line
+    assert "double_sphere" in line
+
+
+def test_a_missing_transform_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    def forget(message: Any) -> None:
+        message.transforms = [link for link in message.transforms if not link.child_frame_id.startswith("right")]
+
+    entries = recordings.changed(recordings.sample_entries(1), "/tf_static", forget)
+    line = refusal(recordings.write_rosbag2(tmp_path / "no_transform", entries), tmp_path, capsys)
+    assert "right_camera_optical_frame" in line
+    assert "base_footprint" in refusal(SAMPLE, tmp_path, capsys, "--base-frame", "base_footprint")

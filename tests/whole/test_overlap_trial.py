@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The overlap monitor on the sample: a turned and a blurred camera are named; told by the tool that says how soon."""
+
+import importlib.util
+import sys
+from argparse import Namespace
+from typing import Any
+
+import pytest
+from recordings import SAMPLE
+from repository import ROOT
+
+from cvcdepth_core.rig_health.overlap_monitor import OverlapMonitor
+
+TOOL = ROOT / "tools" / "overlap_trial.py"
+
+
+@pytest.fixture(scope="module")
+def tool():
+    spec = importlib.util.spec_from_file_location("overlap_trial", TOOL)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["overlap_trial"] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules["overlap_trial"]
+
+
+@pytest.fixture(scope="module")
+def drive(tool: Any):
+    return tool.recorded_drive(SAMPLE)
+
+
+@pytest.mark.parametrize(
+    ("camera", "change"), [("left", "yaw 1 degree"), ("front", "pitch 1 degree"), ("back", "blurred")]
+)
+def test_on_a_real_street_the_right_camera_alone_is_named_within_five_seconds(
+    tool: Any, drive: Any, camera: str, change: str
+):
+    changed = drive.changed(drive.rig.names.index(camera), tool.CHANGES[change])
+    seconds = tool.trial(drive, changed, camera, Namespace(healthy=8.0, seconds=5.0), [])
+    assert 0 < float(seconds) < 5  # the names of others would stand behind the number
+
+
+def test_the_trial_tells_what_was_not_found_and_who_was_named_instead(tool: Any):
+    assert tool.outcome({}, "back") == "**not found**"
+    assert tool.outcome({"left": -1.0}, "back") == "**not found** (left at -1.0)"
+    assert tool.outcome({"left or back": 2.0, "back": 3.0}, "back") == "2.0 (left or back at 2.0)"
+
+
+def test_a_confirmed_camera_does_not_confirm_what_another_one_shows_for_a_moment(drive: Any):
+    monitor = OverlapMonitor(drive.rig)
+
+    def measure() -> None:
+        for trend in monitor._trends:
+            trend.measurements += 1
+
+    left, right = drive.rig.names.index("left"), drive.rig.names.index("right")
+    values = dict.fromkeys(monitor._pairs, 0.0)
+    values |= {pair: 1.0 for pair in values if left in pair}
+    assert not list(monitor._named("misalignment", values, 0.5, 0))
+    measure()
+    values |= {pair: 2.0 for pair in values if right in pair}
+    named = [finding.cameras for finding in monitor._named("misalignment", values, 0.5, 10**9)]
+    assert named == [("left",)]
+    measure()
+    named = [finding.cameras for finding in monitor._named("misalignment", values, 0.5, 2 * 10**9)]
+    assert sorted(named) == [("left",), ("right",)]
