@@ -20,18 +20,15 @@ from cvcdepth_core.rendering.projection import back_project, rigid_inverse, tran
 from cvcdepth_core.rendering.view_synthesis import align_intensity, sample, warp_views
 from cvcdepth_core.training.batch import RigBatch
 from cvcdepth_core.training.losses import auto_mask, masked_mean, smoothness
-from cvcdepth_core.training.model import SurroundModel
+from cvcdepth_core.training.model import SurroundModel, rig_images
 from cvcdepth_core.training.objective import ObjectiveConfig, Prediction
 
 
 def predict_one_by_one(model: SurroundModel, batch: RigBatch) -> Prediction:
     """Return what the model says when it sees one camera at a time."""
-    disparity = torch.stack(
-        [
-            torch.cat([model.depth_net(camera[None]).to(batch.frames.dtype) for camera in cameras])
-            for cameras in batch.images
-        ]
-    )
+    rig = rig_images(batch, batch.images)
+    one_by_one = [model.depth_net(rig.of_cameras([camera])) for camera in range(batch.cameras)]
+    disparity = torch.cat(one_by_one, dim=1).to(batch.frames.dtype)
     focal_lengths = batch.intrinsics[..., 0, 0]
     depth = disparity_to_depth(disparity, focal_lengths, model.min_depth, model.max_depth, model.focal_scale)
     no_flip = torch.zeros(len(batch.frames), dtype=torch.bool, device=batch.frames.device)

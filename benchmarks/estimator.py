@@ -25,9 +25,8 @@ from measuring import Timings, json_lines, peak_memory_mb, print_line, times_qui
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from cvcdepth_core.images.decoding import Picture
-    from cvcdepth_core.networks import DepthNet
-    from cvcdepth_core.networks.checkpoint import DepthModelSpec
+    from cvcdepth_core.networks import DepthModelSpec, DepthNetwork
+    from cvcdepth_core.surround_depth import SurroundPictures
 
 CAMERAS = 6
 BASELINE = ("torch eager batch", "resnet18", 384, 640)
@@ -158,37 +157,43 @@ def work(connection: Connection, case: Case, device: str, threads: int) -> None:
 
 def estimate_of(case: Case, device: str) -> Callable[[], Depth]:
     """Return what is measured; pictures and weights are the same for every engine of a network."""
-    from cvcdepth_core.engines.parity import street_like_picture
+    from cvcdepth_core.engines.example_rigs import street_like_picture
     from cvcdepth_core.estimator import DepthEstimator, untrained_network
-    from cvcdepth_core.networks.checkpoint import DepthModelSpec
+    from cvcdepth_core.networks.registry import DepthModelSpec
+    from cvcdepth_core.surround_depth import SurroundPictures
 
     engine, encoder, height, width = case
     spec = DepthModelSpec(encoder=encoder, height=height, width=width, min_depth=0.5, max_depth=100.0)
     pictures = [np.roll(street_like_picture(height, width), 17 * camera, axis=1) for camera in range(CAMERAS)]
-    fx = np.full(CAMERAS, 0.5 * width)
-    network = untrained_network(encoder)
+    surround = SurroundPictures(
+        pictures=np.stack(pictures),
+        present=np.ones(CAMERAS, bool),
+        intrinsics=np.tile([[0.5 * width, 0, width / 2], [0, 0.5 * width, height / 2], [0, 0, 1]], (CAMERAS, 1, 1)),
+        base_T_camera=np.tile(np.eye(4), (CAMERAS, 1, 1)),
+        valid=np.ones((CAMERAS, height, width), bool),
+    )
+    network = untrained_network(spec)
     if engine in (BASELINE[0], KEPT_BUFFERS):
-        return straightforward(network, spec, pictures, fx, device)
+        return straightforward(network, spec, surround, device)
     backend, _, precision = engine.partition(" ")
     estimator = DepthEstimator(network, spec, "random", device, backend, precision or "float32")  # type: ignore[arg-type]
-    return lambda: estimator.estimate(pictures, fx)
+    return lambda: estimator.estimate(surround)
 
 
 def straightforward(
-    network: DepthNet, spec: DepthModelSpec, pictures: list[Picture], fx: NDArray[np.float64], device: str
+    network: DepthNetwork, spec: DepthModelSpec, surround: SurroundPictures, device: str
 ) -> Callable[[], Depth]:
     """Return the pipeline that anyone would write first: one batch through the network."""
     import torch
 
-    from cvcdepth_core.images.rectifier import to_tensor
-    from cvcdepth_core.networks import disparity_to_depth
+    from cvcdepth_core.networks import RigImages, disparity_to_depth
 
     network.eval().to(device)
-    focal_lengths = torch.as_tensor(fx, dtype=torch.float32, device=device)
+    focal_lengths = torch.as_tensor(surround.fx, dtype=torch.float32, device=device)
 
     @torch.inference_mode()
     def estimate() -> Depth:
-        disparity = network(to_tensor(pictures, device))
+        disparity = network(RigImages.from_pictures(surround, device=device))[0]
         depth = disparity_to_depth(disparity, focal_lengths, spec.min_depth, spec.max_depth, spec.focal_scale)
         return depth[:, 0].cpu().numpy()  # type: ignore[no-any-return]
 

@@ -22,7 +22,7 @@ from measuring import json_lines, measure_in_turns, print_line
 from torch.utils.data import DataLoader, Dataset
 
 from cvcdepth_core.images.decoding import Reduction, decode_compressed
-from cvcdepth_core.networks.checkpoint import DepthModelSpec
+from cvcdepth_core.networks.registry import DepthModelSpec
 from cvcdepth_core.training.config import OptimizerConfig, RecordingsConfig, TrainingConfig
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.settings import MatchingSettings

@@ -33,8 +33,10 @@ from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 
 from cvcdepth_core.estimator import DepthPredictor
+from cvcdepth_core.rig.calibration import Calibration, scale_intrinsics
 from cvcdepth_core.rig.poses import Pose, inverse, pose_from_quaternion
 from cvcdepth_core.rig.rig import Camera, Rig
+from cvcdepth_core.surround_depth import SurroundPictures
 from cvcdepth_ros.bags import RecordedMessage, Recording, RecordingWriter, open_recording
 from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings
 from cvcdepth_ros.evaluation.measuring import open_evaluation
@@ -201,10 +203,19 @@ def estimated(images: list[Any], rig: Rig, network: DepthPredictor) -> NDArray[n
         c = camera.calibration
         flat = cv2.undistort(raw, c.raw_intrinsics, c.distortion, None, c.rectified_intrinsics)
         pictures.append(cv2.resize(flat, size, interpolation=cv2.INTER_AREA))
-    calibrations = [camera.calibration for camera in rig.cameras]
-    return network.estimate(
-        pictures, np.array([c.rectified_intrinsics[0, 0] * size[0] / c.image_size[0] for c in calibrations])
+    surround = SurroundPictures(
+        pictures=np.stack(pictures),
+        present=np.ones(len(pictures), bool),
+        intrinsics=np.stack([scaled_intrinsics(camera.calibration, size) for camera in rig.cameras]),
+        base_T_camera=np.stack([camera.base_T_camera for camera in rig.cameras]),
+        valid=np.ones((len(pictures), size[1], size[0]), bool),
     )
+    return network.estimate(surround)
+
+
+def scaled_intrinsics(calibration: Calibration, size: tuple[int, int]) -> NDArray[np.float64]:
+    width, height = calibration.image_size
+    return scale_intrinsics(calibration.rectified_intrinsics, (size[0] / width, size[1] / height))
 
 
 def abs_rel(depth: NDArray[np.float32], points: NDArray[np.float64], camera: Camera) -> float:

@@ -2,7 +2,6 @@
 """Surround pictures in, metric depth out: the one estimator behind the node, the bag tool and the evaluation."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -13,23 +12,11 @@ from numpy.typing import NDArray
 from cvcdepth_core.engines import Precision, build_engine
 from cvcdepth_core.images.decoding import Picture
 from cvcdepth_core.images.rectifier import SurroundPreprocessor
-from cvcdepth_core.networks import DepthNet, disparity_to_depth
-from cvcdepth_core.networks.checkpoint import DepthModelSpec, load_checkpoint
+from cvcdepth_core.networks import DepthNetwork, build_depth_network, disparity_to_depth
+from cvcdepth_core.networks.checkpoint import load_checkpoint
+from cvcdepth_core.networks.registry import DepthModelSpec
 from cvcdepth_core.rig.rig import Rig
-
-
-@dataclass(frozen=True, eq=False)
-class SurroundDepth:
-    """What was estimated for one surround set; every array holds the cameras in the rig's order."""
-
-    depth: NDArray[np.float32]
-    """[N, H, W] metres along each camera's optical axis, NaN where unknown (REP 118)."""
-    pictures: NDArray[np.uint8]
-    """[N, H, W, 3] RGB, rectified: pixel by pixel what `depth` describes."""
-    intrinsics: NDArray[np.float64]
-    """[N, 3, 3] of those pictures, pixel centres at the integers."""
-    present: NDArray[np.bool_]
-    """[N] which cameras gave a picture; the others' depth is NaN and their picture black."""
+from cvcdepth_core.surround_depth import SurroundDepth, SurroundPictures
 
 
 class PictureSize(Protocol):
@@ -55,8 +42,12 @@ class DepthPredictor(Protocol):
     def model_id(self) -> str:
         """What reports call it."""
 
-    def estimate(self, pictures: Sequence[Picture], fx: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Return depth [N, H, W] in metres of RGB pictures [H, W, 3]; `fx` [N] is in pixels of those pictures."""
+    @property
+    def independent(self) -> bool:
+        """Whether a camera's depth depends on no other camera: then pictures that nobody wants may be left out."""
+
+    def estimate(self, surround: SurroundPictures) -> NDArray[np.float32]:
+        """Return depth [N, H, W] in metres of one set; absent cameras' means nothing."""
 
 
 class DepthEstimator:
@@ -64,7 +55,7 @@ class DepthEstimator:
 
     def __init__(
         self,
-        network: DepthNet,
+        network: DepthNetwork,
         spec: DepthModelSpec,
         weights_id: str,
         device: str = "auto",
@@ -88,9 +79,9 @@ class DepthEstimator:
     def untrained(cls, spec: DepthModelSpec, device: str = "auto", seed: int = 0, **engine: Any) -> "DepthEstimator":
         """Build a network with random weights: its depth has the right form and no meaning."""
         return cls(
-            untrained_network(spec.encoder, seed),
+            untrained_network(spec, seed),
             spec,
-            f"untrained {spec.encoder} (random weights, seed {seed})",
+            f"untrained {spec.kind} (random weights, seed {seed})",
             device,
             **engine,
         )
@@ -105,16 +96,21 @@ class DepthEstimator:
         """Where inference runs."""
         return self._engine.device
 
-    def estimate(self, pictures: Sequence[Picture], fx: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Return depth [N, H, W] in metres of RGB pictures [H, W, 3]; `fx` [N] is in pixels of those pictures.
+    @property
+    def independent(self) -> bool:
+        """As the network declares it."""
+        return self._engine.independent
 
-        On a CPU a picture's depth does not depend on the others. Raises EngineError when the device fails or has too
-        little memory.
+    def estimate(self, surround: SurroundPictures) -> NDArray[np.float32]:
+        """Return depth [N, H, W] in metres of one set; absent cameras' means nothing.
+
+        On a CPU an independent camera's depth does not depend on the others to the last bit. Raises EngineError when
+        the device fails or has too little memory.
         """
         with torch.inference_mode():
             depth = disparity_to_depth(
-                self._engine.disparity(pictures),
-                torch.as_tensor(fx, dtype=torch.float32),
+                self._engine.disparity(surround),
+                torch.as_tensor(surround.fx, dtype=torch.float32),
                 self.spec.min_depth,
                 self.spec.max_depth,
                 self.spec.focal_scale,
@@ -123,11 +119,11 @@ class DepthEstimator:
         return metres
 
 
-def untrained_network(encoder: str, seed: int = 0) -> DepthNet:
+def untrained_network(spec: DepthModelSpec, seed: int = 0) -> DepthNetwork:
     """Return a depth network whose weights are random and always the same."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        return DepthNet(encoder)
+        return build_depth_network(spec)
 
 
 class SurroundDepthEstimator:
@@ -143,27 +139,33 @@ class SurroundDepthEstimator:
         self.preprocessor: SurroundPreprocessor = SurroundPreprocessor(
             rig, estimator.spec.height, estimator.spec.width, known.preprocessor if known else None
         )
+        self._base_T_camera = np.stack([camera.base_T_camera for camera in rig.cameras])
 
     def warm_up(self) -> None:
         """Estimate black pictures, so that what an engine does but once for so many cameras is done."""
         self.estimate(list(np.zeros((*self.preprocessor.valid.shape, 3), np.uint8)))
 
     def estimate(self, rectified: Sequence[Picture | None]) -> SurroundDepth:
-        """Estimate one set from its rectified pictures [H, W, 3] in the rig's order, None where none is wanted.
+        """Estimate one set from its rectified pictures [H, W, 3] in the rig's order, None where none is wanted or had.
 
-        The predictor gets only the pictures that are there.
+        What is not given is absent for the predictor.
         """
-        cameras = [index for index, picture in enumerate(rectified) if picture is not None]
-        pictures = [picture for picture in rectified if picture is not None]
-        valid, intrinsics = self.preprocessor.valid, self.preprocessor.intrinsics
-        surround = SurroundDepth(
-            depth=np.full(valid.shape, np.nan, dtype=np.float32),
-            pictures=np.zeros((*valid.shape, 3), dtype=np.uint8),
-            intrinsics=intrinsics,
-            present=np.isin(np.arange(len(valid)), cameras),
+        pictures = self._surround_pictures(rectified)
+        depth = np.full(pictures.valid.shape, np.nan, dtype=np.float32)
+        if pictures.present.any():
+            known = pictures.valid & pictures.present[:, None, None]
+            np.copyto(depth, self.estimator.estimate(pictures), where=known)
+        return SurroundDepth(depth, pictures.pictures, pictures.intrinsics, pictures.present)
+
+    def _surround_pictures(self, rectified: Sequence[Picture | None]) -> SurroundPictures:
+        pictures = np.zeros((*self.preprocessor.valid.shape, 3), dtype=np.uint8)
+        for place, picture in zip(pictures, rectified, strict=True):
+            if picture is not None:
+                place[:] = picture
+        return SurroundPictures(
+            pictures=pictures,
+            present=np.array([picture is not None for picture in rectified]),
+            intrinsics=self.preprocessor.intrinsics,
+            base_T_camera=self._base_T_camera,
+            valid=self.preprocessor.valid,
         )
-        estimated = self.estimator.estimate(pictures, intrinsics[cameras, 0, 0]) if pictures else ()
-        for index, picture, depth in zip(cameras, pictures, estimated, strict=True):
-            np.copyto(surround.depth[index], depth, where=valid[index])
-            surround.pictures[index] = picture
-        return surround

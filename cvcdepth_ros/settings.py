@@ -66,7 +66,8 @@ class ModelSettings(Settings):
     def build_estimator(self) -> "DepthEstimator":
         """Load the checkpoint, or make the untrained network; CheckpointError or ConfigError says what is wrong."""
         from cvcdepth_core.estimator import DepthEstimator
-        from cvcdepth_core.networks.checkpoint import DepthModelSpec, check_sha256
+        from cvcdepth_core.networks.checkpoint import check_sha256
+        from cvcdepth_core.networks.registry import DepthModelSpec
 
         engine = self.model_dump(include={"backend", "precision", "cpu_fallback"})
         path = self.checkpoint_path

@@ -21,7 +21,8 @@ import torch
 
 from cvcdepth_core.errors import ConfigError
 from cvcdepth_core.networks import DepthNet, PoseNet
-from cvcdepth_core.networks.checkpoint import DepthModelSpec, load_imagenet_encoder, save_checkpoint
+from cvcdepth_core.networks.checkpoint import load_imagenet_encoder, save_checkpoint
+from cvcdepth_core.networks.registry import DepthModelSpec
 from cvcdepth_core.training.config import load_training_config
 
 

@@ -22,10 +22,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cvcdepth_core.estimator import DepthEstimator, SurroundDepth
+from cvcdepth_core.estimator import SurroundDepthEstimator
 from cvcdepth_core.images.decoding import Picture
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.rig_health.overlap_monitor import OverlapMonitor
+from cvcdepth_core.surround_depth import SurroundDepth
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.recordings.replay import DepthReplay, SurroundReplay
 from cvcdepth_ros.recordings.rig import discover_rig
@@ -41,7 +42,7 @@ class Drive:
     """A recording's sets with their depth."""
 
     rig: Rig
-    estimator: DepthEstimator
+    estimator: SurroundDepthEstimator
     sets: Sequence[SurroundDepth]
 
     def changed(self, camera: int, change: Change) -> Drive:
@@ -56,7 +57,8 @@ class Drive:
         depth, pictures = surround.depth.copy(), surround.pictures.copy()
         intrinsics = surround.intrinsics[camera]
         pictures[camera] = change(pictures[camera], intrinsics)
-        depth[camera] = self.estimator.estimate([pictures[camera]], intrinsics[None, 0, 0])[0]
+        alone = [picture if index == camera else None for index, picture in enumerate(pictures)]
+        depth[camera] = self.estimator.estimate(alone).depth[camera]
         return replace(surround, depth=depth, pictures=pictures)
 
 
@@ -89,7 +91,8 @@ def recorded_drive(path: Path) -> Drive:
     with open_recording(path) as recording:
         replay = SurroundReplay(recording, discover_rig(recording), MatchingSettings())
         found = list(DepthReplay(replay, estimator).sets())
-    return Drive(found[0].rig, estimator, [estimated.depth for estimated in found])
+    rig = found[0].rig
+    return Drive(rig, SurroundDepthEstimator(rig, estimator), [estimated.depth for estimated in found])
 
 
 def trial(healthy: Drive, changed: Drive, name: str, options: argparse.Namespace, costs: list[float]) -> str:

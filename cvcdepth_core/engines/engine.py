@@ -1,28 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
 """What every inference engine offers."""
 
+from collections.abc import Callable
 from typing import Literal, Protocol
 
 import torch
 from torch import Tensor
 
 from cvcdepth_core.errors import EngineError
+from cvcdepth_core.networks import DepthNetwork, RigImages
 
 Precision = Literal["float32", "bfloat16", "float16"]
 """In what an engine computes; depth is float32 always."""
 
 
 class DeviceMemoryError(EngineError):
-    """The device has too little memory for so many images at once."""
+    """The device has too little memory for so many cameras at once."""
 
 
-def best_chunk(device: torch.device) -> int | None:
-    """Return how many images torch and ONNX Runtime take best at a time on the device: one on a CPU, all on a GPU.
+def best_chunk(network: DepthNetwork, device: torch.device) -> int | None:
+    """Return how many cameras torch and ONNX Runtime take best at a time: one on a CPU, all on a GPU.
 
     One by one, a camera's depth depends on no other camera, to the last bit; it is also quicker than all at once, for
-    the feature maps of one stay in the cache.
+    the feature maps of one stay in the cache. A network whose cameras are not independent has to see all.
     """
-    return 1 if device.type == "cpu" else None
+    return 1 if network.independent and device.type == "cpu" else None
+
+
+def image_by_image(run: Callable[[Tensor], Tensor], rig: RigImages) -> Tensor:
+    """Return the disparity [B, N, 1, H, W] by an engine's `run`, which takes images [B*N, 3, H, W] alone."""
+    disparity = run(rig.images.flatten(0, 1))
+    return disparity.view(*rig.images.shape[:2], *disparity.shape[1:])
 
 
 class DisparityEngine(Protocol):
@@ -38,10 +46,10 @@ class DisparityEngine(Protocol):
 
     @property
     def chunk(self) -> int | None:
-        """How many images it takes best at a time; None: all there are."""
+        """How many cameras it takes best at a time; None: all there are."""
 
-    def disparity(self, images: Tensor) -> Tensor:
-        """Return the disparity [B, 1, H, W] in (0, 1) of `images` [B, 3, H, W] in [0, 1], float32 on `device`.
+    def disparity(self, rig: RigImages) -> Tensor:
+        """Return the disparity [B, N, 1, H, W] in (0, 1) of a rig's images, float32 on `device`.
 
-        Raises DeviceMemoryError, or torch's own error, when the device's memory is too small for B images.
+        Raises DeviceMemoryError, or torch's own error, when the device's memory is too small for so many cameras.
         """

@@ -3,25 +3,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from cvcdepth_core.engines.engine import DeviceMemoryError, DisparityEngine
 from cvcdepth_core.errors import EngineError
-from cvcdepth_core.images.decoding import Picture
-from cvcdepth_core.images.rectifier import to_tensor
+from cvcdepth_core.networks import RigImages
+from cvcdepth_core.surround_depth import SurroundPictures
 
 
 class GuardedEngine:
-    """Runs an engine on as many pictures at a time as it takes best and its memory holds, and replaces it if it fails.
+    """Runs an engine on as many cameras at a time as it takes best and its memory holds, and replaces it if it fails.
+
+    Of a network that looks at all cameras together, none is left out and none runs apart from the others.
 
     A GPU works behind the program's back and tells its faults later: a result counts when it has left the device whole.
     """
 
-    def __init__(self, engine: DisparityEngine, fallback: Callable[[], DisparityEngine] | None = None) -> None:
-        """`fallback` builds the engine to go on with when the device fails, or cannot hold even one picture."""
+    def __init__(
+        self, engine: DisparityEngine, independent: bool, fallback: Callable[[], DisparityEngine] | None = None
+    ) -> None:
+        """`independent` is as the network declares it.
+
+        `fallback` builds the engine to go on with when the device fails, or cannot hold even one picture.
+        """
+        self.independent = independent
         self._engine = engine
         self._fallback = fallback
         self._chunk = engine.chunk
@@ -36,18 +46,22 @@ class GuardedEngine:
         """Where the engine computes."""
         return self._engine.device
 
-    def disparity(self, pictures: Sequence[Picture]) -> Tensor:
-        """Return the disparity [N, 1, H, W] in (0, 1), float32 on the CPU, of RGB pictures [H, W, 3].
+    def disparity(self, surround: SurroundPictures) -> Tensor:
+        """Return the disparity [N, 1, H, W] in (0, 1), float32 on the CPU; absent cameras' means nothing.
 
-        A number of pictures that the memory did not hold is not tried again. Raises EngineError when the device fails
-        or does not hold one picture, and there is no fallback.
+        A number of cameras that the memory did not hold is not tried again. Raises EngineError when the device fails
+        or does not hold the least that the network can take, and there is no fallback.
         """
+        everyone = np.arange(len(surround.present))
+        cameras = everyone[surround.present] if self.independent else everyone
         while True:
-            chunk = min(self._chunk or len(pictures), len(pictures))
+            chunk = max(1, min(self._chunk or len(cameras), len(cameras)))
             try:
-                return self._in_chunks(pictures, chunk)
+                return self._in_chunks(surround, cameras, chunk)
             except (torch.cuda.OutOfMemoryError, DeviceMemoryError) as error:
-                if chunk == 1:
+                if not self.independent:
+                    self._replace("out of memory with all cameras, which the network must see together", error)
+                elif chunk == 1:
                     self._replace("out of memory with a single picture", error)
                 else:
                     torch.cuda.empty_cache()
@@ -55,9 +69,12 @@ class GuardedEngine:
             except (RuntimeError, EngineError) as error:  # torch's word for a lost GPU is a RuntimeError
                 self._replace("failed", error)
 
-    def _in_chunks(self, pictures: Sequence[Picture], chunk: int) -> Tensor:
-        chunks = [pictures[start : start + chunk] for start in range(0, len(pictures), chunk)]
-        return torch.cat([self._engine.disparity(to_tensor(part, self.device)).cpu() for part in chunks])
+    def _in_chunks(self, surround: SurroundPictures, cameras: NDArray[np.intp], chunk: int) -> Tensor:
+        disparity = torch.zeros(len(surround.present), 1, *surround.pictures.shape[1:3])
+        for start in range(0, len(cameras), chunk):
+            part = cameras[start : start + chunk]
+            disparity[part] = self._engine.disparity(RigImages.from_pictures(surround, part, self.device))[0].cpu()
+        return disparity
 
     def _replace(self, what: str, error: Exception) -> None:
         if self._fallback is None:

@@ -13,10 +13,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from cvcdepth_core.engines.engine import image_by_image
 from cvcdepth_core.engines.ncnn_graph import INPUT, OUTPUT, ncnn_model
 from cvcdepth_core.engines.rewriting import RewrittenDepthNet
 from cvcdepth_core.errors import EngineError
-from cvcdepth_core.networks import DepthNet
+from cvcdepth_core.networks import DepthNet, RigImages
 
 
 class NcnnEngine:
@@ -38,8 +39,11 @@ class NcnnEngine:
         self._model = ncnn_model(RewrittenDepthNet(network, transposed=False))
         self._net = self._load()
 
-    def disparity(self, images: Tensor) -> Tensor:
+    def disparity(self, rig: RigImages) -> Tensor:
         """See `DisparityEngine`. The largest set so far decides how many threads each image has."""
+        return image_by_image(self._each, rig)
+
+    def _each(self, images: Tensor) -> Tensor:
         threads = max(1, self._threads // len(images))
         if threads < self._threads_per_image:
             self._threads_per_image = threads

@@ -3,22 +3,25 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import inspect
 import io
 import os
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from cvcdepth_core.engines.engine import DeviceMemoryError, Precision, best_chunk
+from cvcdepth_core.engines.engine import DeviceMemoryError, Precision, best_chunk, image_by_image
+from cvcdepth_core.engines.example_rigs import ring_of_cameras
 from cvcdepth_core.engines.rewriting import RewrittenDepthNet
 from cvcdepth_core.errors import EngineError
-from cvcdepth_core.networks import DepthNet
-from cvcdepth_core.networks.checkpoint import DepthModelSpec
+from cvcdepth_core.networks import DepthNet, DepthNetwork, RigImages
+from cvcdepth_core.networks.registry import DepthModelSpec
 
 INPUT, OUTPUT = "images", "disparity"
 MOST_CAMERAS = 12
@@ -28,25 +31,47 @@ _OPSET = 17
 _USUAL_CAMERAS = 6
 
 
-def onnx_model(network: DepthNet, spec: DepthModelSpec) -> bytes:
-    """Return an ONNX model: `images` [B, 3, H, W] in [0, 1] to `disparity` [B, 1, H, W], of any B, H and W.
+def onnx_model(network: DepthNetwork, spec: DepthModelSpec) -> bytes:
+    """Return the network as an ONNX model.
 
-    H and W are multiples of 32; those of `spec` are what the network was trained for.
+    The published network becomes `images` [B, 3, H, W] in [0, 1] to `disparity` [B, 1, H, W], of any B, H and W; H and
+    W are multiples of 32, those of `spec` are what the network was trained for. Any other one takes the fields of
+    `RigImages` by their names and gives `disparity` [1, N, 1, H, W], of any N, at the size of `spec`.
     """
-    example = torch.zeros(1, 3, spec.height, spec.width)
+    if isinstance(network, DepthNet):
+        images = {INPUT: torch.zeros(1, 3, spec.height, spec.width)}
+        return _exported(RewrittenDepthNet(network), images, {0: "cameras", 2: "height", 3: "width"})
+    rig = ring_of_cameras(spec.height, spec.width)
+    return _exported(_OnTensors(copy.deepcopy(network).eval()), rig._asdict(), {1: "cameras"})
+
+
+class _OnTensors(nn.Module):
+    """A network of the rig as the exporter wants it: tensors in, a tensor out."""
+
+    def __init__(self, network: DepthNetwork) -> None:
+        super().__init__()
+        self._network = network
+
+    def forward(self, *parts: Tensor) -> Tensor:
+        disparity: Tensor = self._network(RigImages(*parts))
+        return disparity
+
+
+def _exported(network: nn.Module, inputs: dict[str, Tensor], axes: dict[int, str]) -> bytes:
+    """Export for inputs of the examples' sizes, but for the named `axes`, which may have any."""
     content = io.BytesIO()
     # The newer exporter needs two more packages and gives the same graph; torch before 2.5 does not know the word.
     older = {"dynamo": False} if "dynamo" in inspect.signature(torch.onnx.export).parameters else {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         torch.onnx.export(
-            RewrittenDepthNet(network).float().cpu(),
-            (example,),
+            network.float().cpu(),
+            tuple(inputs.values()),
             content,  # type: ignore[arg-type]
             opset_version=_OPSET,
-            input_names=[INPUT],
+            input_names=list(inputs),
             output_names=[OUTPUT],
-            dynamic_axes={name: {0: "cameras", 2: "height", 3: "width"} for name in (INPUT, OUTPUT)},
+            dynamic_axes=dict.fromkeys((*inputs, OUTPUT), axes),
             **older,  # type: ignore[arg-type]
         )
     return content.getvalue()
@@ -55,21 +80,25 @@ def onnx_model(network: DepthNet, spec: DepthModelSpec) -> bytes:
 class OnnxRuntimeEngine:
     """The exported network in ONNX Runtime; on a CPU on as many threads as torch has when it is built."""
 
-    def __init__(self, network: DepthNet, spec: DepthModelSpec, device: torch.device) -> None:
+    def __init__(self, network: DepthNetwork, spec: DepthModelSpec, device: torch.device) -> None:
         """EngineError when this ONNX Runtime cannot use `device`."""
         import onnxruntime
 
         provider = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}[device.type]
         options = {"device_id": device.index or 0} if device.type == "cuda" else {}
         self.device = device
-        self.chunk = best_chunk(device)
+        self.chunk = best_chunk(network, device)
         self.name = f"onnxruntime {onnxruntime.__version__} {device.type} float32"
         self.model = onnx_model(network, spec)
         self._session = _session(self.model, [(provider, options)])
+        self._takes_images = isinstance(network, DepthNet)
+        self._inputs = [given.name for given in self._session.get_inputs()]
 
-    def disparity(self, images: Tensor) -> Tensor:
+    def disparity(self, rig: RigImages) -> Tensor:
         """See `DisparityEngine`."""
-        return _run(self._session, images)
+        if self._takes_images:
+            return image_by_image(lambda images: _run(self._session, {INPUT: images}), rig)
+        return _run(self._session, {name: getattr(rig, name) for name in self._inputs})
 
 
 class TensorRtEngine:
@@ -87,7 +116,7 @@ class TensorRtEngine:
         import onnxruntime
 
         self.device = device
-        self.chunk = best_chunk(device)
+        self.chunk = best_chunk(network, device)
         self.name = f"tensorrt of onnxruntime {onnxruntime.__version__} {precision}"
         folder = engine_folder(network, spec, device, precision)
         if not build and not any(folder.glob("*.engine")):
@@ -100,9 +129,12 @@ class TensorRtEngine:
         cuda = ("CUDAExecutionProvider", {"device_id": device.index or 0})  # for what TensorRT does not know
         self._session = _session(onnx_model(network, spec), [("TensorrtExecutionProvider", options), cuda])
 
-    def disparity(self, images: Tensor) -> Tensor:
+    def disparity(self, rig: RigImages) -> Tensor:
         """See `DisparityEngine`."""
-        return torch.cat([_run(self._session, chunk) for chunk in images.split(MOST_CAMERAS)])  # type: ignore[no-untyped-call]
+        return image_by_image(self._each, rig)
+
+    def _each(self, images: Tensor) -> Tensor:
+        return torch.cat([_run(self._session, {INPUT: part}) for part in images.split(MOST_CAMERAS)])  # type: ignore[no-untyped-call]
 
 
 def engine_folder(network: DepthNet, spec: DepthModelSpec, device: torch.device, precision: Precision) -> Path:
@@ -158,11 +190,11 @@ def _session(model: bytes, providers: list[tuple[str, dict[str, Any]]]) -> Any:
     return session
 
 
-def _run(session: Any, images: Tensor) -> Tensor:
+def _run(session: Any, inputs: Mapping[str, Tensor]) -> Tensor:
     try:
-        (disparity,) = session.run([OUTPUT], {INPUT: images.cpu().numpy()})
+        (disparity,) = session.run([OUTPUT], {name: value.cpu().numpy() for name, value in inputs.items()})
     except Exception as error:
         if "memory" in str(error).lower() or "alloc" in str(error).lower():
             raise DeviceMemoryError(str(error)) from error
         raise EngineError(f"onnxruntime: inference failed: {error}") from error
-    return torch.from_numpy(disparity).to(images.device)
+    return torch.from_numpy(disparity).to(next(iter(inputs.values())).device)

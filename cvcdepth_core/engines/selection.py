@@ -15,8 +15,8 @@ from cvcdepth_core.engines.guarded_engine import GuardedEngine
 from cvcdepth_core.engines.parity import check_parity
 from cvcdepth_core.engines.torch_engine import TorchEagerEngine, TorchEngine
 from cvcdepth_core.errors import ConfigError, EngineError
-from cvcdepth_core.networks import DepthNet
-from cvcdepth_core.networks.checkpoint import DepthModelSpec
+from cvcdepth_core.networks import DepthNet, DepthNetwork
+from cvcdepth_core.networks.registry import DepthModelSpec
 
 Backend = Literal["auto", "ncnn", "torch", "torch_eager", "torch_compiled", "onnxruntime", "tensorrt"]
 
@@ -33,7 +33,7 @@ _HALF_PRECISION = ("torch", "torch_compiled", "tensorrt")
 
 
 def build_engine(
-    network: DepthNet,
+    network: DepthNetwork,
     spec: DepthModelSpec,
     device: str = "auto",
     backend: str = "auto",
@@ -42,22 +42,24 @@ def build_engine(
 ) -> GuardedEngine:
     """Make the network ready to run, and check that its depth is still the network's.
 
-    `device` auto is CUDA where there is one and the backend can use it. `backend` auto is, on a CPU, ncnn where it is
-    installed, else torch. With `cpu_fallback`, a GPU that fails or is out of memory is replaced by the CPU.
-    Raises ConfigError when the three do not go together, EngineError when the engine is not installed or gives another
+    `device` auto is CUDA where there is one and the backend can use it. `backend` auto is the first of the network's
+    engines that is installed and runs on the device: for the published network on a CPU ncnn, else torch. With
+    `cpu_fallback`, a GPU that fails or is out of memory is replaced by the CPU. Raises ConfigError when the three do
+    not go together or the network has no such engine, EngineError when the engine is not installed or gives another
     depth.
     """
     place = _place(device, backend)
     engine = checked_engine(network, spec, place, backend, precision)
     fallback = partial(checked_engine, network, spec, torch.device("cpu"), "auto", "float32")
-    return GuardedEngine(engine, fallback if cpu_fallback and place.type == "cuda" else None)
+    return GuardedEngine(engine, network.independent, fallback if cpu_fallback and place.type == "cuda" else None)
 
 
 def checked_engine(
-    network: DepthNet, spec: DepthModelSpec, device: torch.device, backend: str, precision: Precision
+    network: DepthNetwork, spec: DepthModelSpec, device: torch.device, backend: str, precision: Precision
 ) -> DisparityEngine:
     """Return the backend's engine, found to give the network's depth; errors as in `build_engine`."""
-    chosen = _choose(backend, device)
+    chosen = _choose(network, spec, device) if backend == "auto" else backend
+    _refuse_unknown_to(network, spec, chosen)
     _refuse_impossible(chosen, device, precision)
     _refuse_missing(chosen)
     engine = _build(chosen, network, spec, device, precision)
@@ -66,11 +68,13 @@ def checked_engine(
     return engine
 
 
-def export_onnx(network: DepthNet, spec: DepthModelSpec) -> tuple[bytes, float]:
+def export_onnx(network: DepthNetwork, spec: DepthModelSpec) -> tuple[bytes, float]:
     """Return the network as an ONNX model and its relative depth error, as ONNX Runtime runs it on the CPU.
 
-    Raises EngineError when onnx or ONNX Runtime is not installed, or the depth is another one.
+    Raises ConfigError when the network has no such engine, EngineError when onnx or ONNX Runtime is not installed, or
+    the depth is another one.
     """
+    _refuse_unknown_to(network, spec, "onnxruntime")
     _refuse_missing("onnxruntime")
     from cvcdepth_core.engines.onnx_engine import OnnxRuntimeEngine
 
@@ -78,18 +82,23 @@ def export_onnx(network: DepthNet, spec: DepthModelSpec) -> tuple[bytes, float]:
     return engine.model, check_parity(engine, network, spec, "float32")
 
 
-def build_tensorrt(network: DepthNet, spec: DepthModelSpec, device: str, precision: Precision) -> tuple[Path, float]:
+def build_tensorrt(
+    network: DepthNetwork, spec: DepthModelSpec, device: str, precision: Precision
+) -> tuple[Path, float]:
     """Build and keep the engine that the backend tensorrt uses; return its folder and its relative depth error.
 
-    Raises ConfigError when `device` is no GPU, EngineError without TensorRT or when the depth is another one.
+    Raises ConfigError when `device` is no GPU or the network has no such engine, EngineError without TensorRT or when
+    the depth is another one.
     """
     place = resolve_device(device)
+    _refuse_unknown_to(network, spec, "tensorrt")
     _refuse_impossible("tensorrt", place, precision)
     _refuse_missing("tensorrt")
     from cvcdepth_core.engines.onnx_engine import TensorRtEngine, engine_folder
 
-    engine = TensorRtEngine(network, spec, place, precision, build=True)
-    return engine_folder(network, spec, place, precision), check_parity(engine, network, spec, precision)
+    published = _published(network, spec, "tensorrt")
+    engine = TensorRtEngine(published, spec, place, precision, build=True)
+    return engine_folder(published, spec, place, precision), check_parity(engine, network, spec, precision)
 
 
 def resolve_device(name: str) -> torch.device:
@@ -117,19 +126,50 @@ def _place(device: str, backend: str) -> torch.device:
     return torch.device("cpu") if device == "auto" and backend in _CPU_ONLY else resolve_device(device)
 
 
-def _choose(backend: str, device: torch.device) -> str:
-    if backend != "auto":
-        return backend
-    return "ncnn" if device.type == "cpu" and is_installed("ncnn") else "torch"
+def _choose(network: DepthNetwork, spec: DepthModelSpec, device: torch.device) -> str:
+    """Return the first of the network's engines that runs here; EngineError says what each of them lacks."""
+    lacking = {}
+    for backend in network.engines:
+        place = _only_on(backend)
+        if place not in (None, device.type):
+            lacking[backend] = f"runs on {place} only"
+        elif not is_installed(backend):
+            lacking[backend] = f"not installed ({_PACKAGES[backend][1]})"
+        else:
+            return backend
+    reasons = ", ".join(f"{backend} {reason}" for backend, reason in lacking.items())
+    raise EngineError(f"network {spec.kind}: none of its engines can run on '{device}': {reasons}")
+
+
+def _only_on(backend: str) -> str | None:
+    """Return the kind of device that the backend is bound to."""
+    if backend in _CPU_ONLY:
+        return "cpu"
+    return "cuda" if backend in _CUDA_ONLY else None
+
+
+def _refuse_unknown_to(network: DepthNetwork, spec: DepthModelSpec, backend: str) -> None:
+    if backend in BACKENDS and backend not in network.engines:
+        known = ", ".join(network.engines)
+        raise ConfigError(f"backend {backend} cannot run the network {spec.kind}: expected auto or one of {known}")
+
+
+def _published(network: DepthNetwork, spec: DepthModelSpec, backend: str) -> DepthNet:
+    """Return the network if it is the one that the backend's rewriting is made for."""
+    if not isinstance(network, DepthNet):
+        raise EngineError(
+            f"backend {backend} rewrites the published network (DepthNet), and the network {spec.kind} is a "
+            f"{type(network).__name__}: take the backend out of its `engines`"
+        )
+    return network
 
 
 def _refuse_impossible(backend: str, device: torch.device, precision: Precision) -> None:
     if backend not in BACKENDS:
         raise ConfigError(f"backend is '{backend}', expected one of {', '.join(BACKENDS)}")
-    needs = {"cpu": backend in _CPU_ONLY, "cuda": backend in _CUDA_ONLY}
-    for place, needed in needs.items():
-        if needed and device.type != place:
-            raise ConfigError(f"backend {backend} runs on {place} only, the device is '{device}'")
+    place = _only_on(backend)
+    if place not in (None, device.type):
+        raise ConfigError(f"backend {backend} runs on {place} only, the device is '{device}'")
     if precision != "float32" and not (device.type == "cuda" and backend in _HALF_PRECISION):
         raise ConfigError(
             f"precision {precision} needs a CUDA device and one of {', '.join(_HALF_PRECISION)}, "
@@ -144,18 +184,21 @@ def _refuse_missing(backend: str) -> None:
 
 
 def _build(
-    backend: str, network: DepthNet, spec: DepthModelSpec, device: torch.device, precision: Precision
+    backend: str, network: DepthNetwork, spec: DepthModelSpec, device: torch.device, precision: Precision
 ) -> DisparityEngine:
     if backend == "torch_eager":
         return TorchEagerEngine(network, device)
+    if backend == "onnxruntime":
+        from cvcdepth_core.engines.onnx_engine import OnnxRuntimeEngine
+
+        return OnnxRuntimeEngine(network, spec, device)
+    published = _published(network, spec, backend)
     if backend == "ncnn":
         from cvcdepth_core.engines.ncnn_engine import NcnnEngine
 
-        return NcnnEngine(network)
-    if backend in ("onnxruntime", "tensorrt"):
-        from cvcdepth_core.engines.onnx_engine import OnnxRuntimeEngine, TensorRtEngine
+        return NcnnEngine(published)
+    if backend == "tensorrt":
+        from cvcdepth_core.engines.onnx_engine import TensorRtEngine
 
-        if backend == "tensorrt":
-            return TensorRtEngine(network, spec, device, precision)
-        return OnnxRuntimeEngine(network, spec, device)
-    return TorchEngine(network, device, precision, compiled=backend == "torch_compiled")
+        return TensorRtEngine(published, spec, device, precision)
+    return TorchEngine(published, device, precision, compiled=backend == "torch_compiled")

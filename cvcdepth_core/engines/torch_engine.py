@@ -9,24 +9,24 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from cvcdepth_core.engines.engine import Precision, best_chunk
+from cvcdepth_core.engines.engine import Precision, best_chunk, image_by_image
 from cvcdepth_core.engines.rewriting import RewrittenDepthNet
-from cvcdepth_core.networks import DepthNet
+from cvcdepth_core.networks import DepthNet, DepthNetwork, RigImages
 
 
 class TorchEagerEngine:
     """The network itself, operation by operation."""
 
-    def __init__(self, network: DepthNet, device: torch.device) -> None:
+    def __init__(self, network: DepthNetwork, device: torch.device) -> None:
         self.name = f"torch_eager {torch.__version__}"
         self.device = device
-        self.chunk = best_chunk(device)
+        self.chunk = best_chunk(network, device)
         self._network = copy.deepcopy(network).eval().to(device)
 
     @torch.inference_mode()
-    def disparity(self, images: Tensor) -> Tensor:
+    def disparity(self, rig: RigImages) -> Tensor:
         """See `DisparityEngine`."""
-        disparity: Tensor = self._network(images)
+        disparity: Tensor = self._network(rig)
         return disparity
 
 
@@ -38,7 +38,7 @@ class TorchEngine:
     ) -> None:
         self.name = f"{'torch_compiled' if compiled else 'torch'} {torch.__version__} {precision}"
         self.device = device
-        self.chunk = best_chunk(device)
+        self.chunk = best_chunk(network, device)
         mixed = MixedPrecision(RewrittenDepthNet(network), getattr(torch, precision))
         mixed = mixed.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._run: Callable[[Tensor], Tensor] = mixed
@@ -46,9 +46,9 @@ class TorchEngine:
             self._run = PaddedBatches(CudaGraphs(torch.compile(mixed, dynamic=False)))
 
     @torch.inference_mode()
-    def disparity(self, images: Tensor) -> Tensor:
+    def disparity(self, rig: RigImages) -> Tensor:
         """See `DisparityEngine`."""
-        return self._run(images.contiguous(memory_format=torch.channels_last))
+        return image_by_image(lambda images: self._run(images.contiguous(memory_format=torch.channels_last)), rig)
 
 
 class PaddedBatches:

@@ -1,8 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The depth network and the pose network."""
+"""The depth networks behind one seam, and the pose network."""
 
 from cvcdepth_core.networks.depth import INPUT_STRIDE, DepthNet, disparity_to_depth
 from cvcdepth_core.networks.encoders import ENCODERS, Encoder, EncoderName
 from cvcdepth_core.networks.pose import PoseNet
+from cvcdepth_core.networks.registry import NETWORKS, DepthModelSpec, build_depth_network
+from cvcdepth_core.networks.rig_images import DepthNetwork, RigImages
 
-__all__ = ["ENCODERS", "INPUT_STRIDE", "DepthNet", "Encoder", "EncoderName", "PoseNet", "disparity_to_depth"]
+__all__ = [
+    "ENCODERS",
+    "INPUT_STRIDE",
+    "NETWORKS",
+    "DepthModelSpec",
+    "DepthNet",
+    "DepthNetwork",
+    "Encoder",
+    "EncoderName",
+    "PoseNet",
+    "RigImages",
+    "build_depth_network",
+    "disparity_to_depth",
+]

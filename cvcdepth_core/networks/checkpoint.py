@@ -13,15 +13,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import ValidationError
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
 from cvcdepth_core.errors import CheckpointError
 from cvcdepth_core.files import write_atomically
-from cvcdepth_core.networks import ENCODERS, INPUT_STRIDE, DepthNet, Encoder
-from cvcdepth_core.networks.depth import MIN_INPUT_SIZE
+from cvcdepth_core.networks.encoders import Encoder
+from cvcdepth_core.networks.registry import DepthModelSpec, build_depth_network
+from cvcdepth_core.networks.rig_images import DepthNetwork
 
 FORMAT_VERSION = "1"
 
@@ -30,38 +31,6 @@ _DEPTH_PREFIX, _POSE_PREFIX, _RELEASED_PREFIX = "depth_net.", "pose_net.", "modu
 _NAMED_KEYS = 3
 
 State = Mapping[str, Tensor]
-
-
-class DepthModelSpec(BaseModel):
-    """What a depth network was built and trained for; it travels with the weights."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
-
-    encoder: str = "resnet18"
-    """One of `ENCODERS`."""
-    height: int = Field(ge=MIN_INPUT_SIZE, multiple_of=INPUT_STRIDE)
-    """Rows of the network input, pixels."""
-    width: int = Field(ge=MIN_INPUT_SIZE, multiple_of=INPUT_STRIDE)
-    """Columns of the network input, pixels."""
-    min_depth: float = Field(gt=0, allow_inf_nan=False)
-    """Metres at disparity 1 for a camera with fx = focal_scale."""
-    max_depth: float = Field(gt=0, allow_inf_nan=False)
-    """Metres at disparity 0 for such a camera."""
-    focal_scale: float = Field(default=300.0, gt=0, allow_inf_nan=False)
-    """Focal length in pixels (at network resolution) for which the depth range is meant."""
-
-    @field_validator("encoder")
-    @classmethod
-    def _encoder_is_known(cls, encoder: str) -> str:
-        if encoder not in ENCODERS:
-            raise ValueError(f"expected one of {', '.join(ENCODERS)}")
-        return encoder
-
-    @model_validator(mode="after")
-    def _depth_range_is_ordered(self) -> DepthModelSpec:
-        if self.min_depth >= self.max_depth:
-            raise ValueError(f"min_depth {self.min_depth} must be below max_depth {self.max_depth}")
-        return self
 
 
 @dataclass(frozen=True)
@@ -78,10 +47,10 @@ class Checkpoint:
     metadata: dict[str, str] = field(default_factory=dict)
     """What the writer added: command, configuration, package version."""
 
-    def build_depth_net(self) -> DepthNet:
+    def build_depth_net(self) -> DepthNetwork:
         """Return the depth network with these weights, in evaluation mode; raises CheckpointError."""
-        network = DepthNet(self.spec.encoder)
-        load_network_state(network, self.depth_net, origin=f"{self.path}: depth network ({self.spec.encoder})")
+        network = build_depth_network(self.spec)
+        load_network_state(network, self.depth_net, origin=f"{self.path}: depth network ({self.spec.kind})")
         return network.eval()
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -11,6 +12,7 @@ from torch.nn import functional as F  # noqa: N812 - the field's name for it
 
 from cvcdepth_core.errors import ImageError
 from cvcdepth_core.networks.encoders import build_encoder
+from cvcdepth_core.networks.rig_images import DepthNetwork, RigImages
 
 INPUT_STRIDE = 32
 """Height and width of the network input must be multiples of this."""
@@ -19,16 +21,24 @@ MIN_INPUT_SIZE = 64
 """Least height and width: the mirrored border needs two pixels of the coarsest feature map."""
 
 
-class DepthNet(nn.Module):
-    """Encoder and decoder with skip connections; every camera of every sample is one element of the batch."""
+class DepthNet(DepthNetwork):
+    """The published network: encoder and decoder with skip connections, every camera's image on its own."""
+
+    independent: ClassVar[bool] = True
+    engines: ClassVar[tuple[str, ...]] = ("ncnn", "torch", "torch_compiled", "onnxruntime", "tensorrt", "torch_eager")
 
     def __init__(self, encoder: str = "resnet18") -> None:
         super().__init__()
         self.depth_encoder = build_encoder(encoder)
         self.depth_decoder = DepthDecoder(self.depth_encoder.channels, self.depth_encoder.decoder_channels)
 
-    def forward(self, images: Tensor) -> Tensor:
-        """Return the disparity [B, 1, H, W] in (0, 1) of `images` [B, 3, H, W] in [0, 1].
+    def forward(self, rig: RigImages) -> Tensor:
+        """Return the disparity [B, N, 1, H, W] in (0, 1); see `disparity` for what is refused."""
+        disparity = self.disparity(rig.images.flatten(0, 1))
+        return disparity.view(*rig.images.shape[:2], *disparity.shape[1:])
+
+    def disparity(self, images: Tensor) -> Tensor:
+        """Return the disparity [B, 1, H, W] in (0, 1) of single `images` [B, 3, H, W] in [0, 1].
 
         Raises ImageError when H or W is not a multiple of 32 or below 64.
         """

@@ -4,17 +4,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cvcdepth_core.errors import ConfigError
-from cvcdepth_core.images.decoding import Picture
 from cvcdepth_core.images.rectifier import SurroundPreprocessor
 from cvcdepth_core.pointcloud import pixel_rays
 from cvcdepth_core.rig.rig import Rig
+from cvcdepth_core.surround_depth import SurroundPictures
 
 REFERENCE_HEIGHT, REFERENCE_WIDTH = 384, 640
 """Rows and columns of the published DDAD network, so that references are compared at the resolution of networks."""
@@ -33,14 +32,15 @@ class FixedDepth:
     def __init__(self, depth: NDArray[np.float32], fx: NDArray[np.float64], model_id: str) -> None:
         """`depth` [N, H, W] in metres is for cameras with the focal lengths `fx` [N], pixels of H x W."""
         self.spec = ReferenceSize(*depth.shape[1:])
+        self.independent = True
         self.model_id = model_id
         self._depth = depth
         self._fx = fx
 
-    def estimate(self, pictures: Sequence[Picture], fx: NDArray[np.float64]) -> NDArray[np.float32]:
+    def estimate(self, surround: SurroundPictures) -> NDArray[np.float32]:
         """Return the depth [N, H, W]; ConfigError when the calibration is not the one it was made for."""
-        if len(pictures) != len(self._depth) or not np.array_equal(fx, self._fx):
-            raise ConfigError(f"{self.model_id}: made for fx {self._fx.tolist()}, asked for fx {fx.tolist()}")
+        if not np.array_equal(surround.fx, self._fx):
+            raise ConfigError(f"{self.model_id}: made for fx {self._fx.tolist()}, asked for fx {surround.fx.tolist()}")
         return np.array(self._depth)
 
 

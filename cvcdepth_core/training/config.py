@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from cvcdepth_core.errors import ConfigError
 from cvcdepth_core.networks import EncoderName
-from cvcdepth_core.networks.checkpoint import DepthModelSpec
+from cvcdepth_core.networks.registry import DepthModelSpec
 from cvcdepth_core.training.augmentation import ColorJitterConfig, FlipMode
 from cvcdepth_core.training.model import PoseMethod
 from cvcdepth_core.training.objective import ObjectiveConfig

@@ -8,15 +8,13 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from cvcdepth_core.networks import DepthNet, PoseNet, disparity_to_depth
-from cvcdepth_core.training.augmentation import mirror, mirror_motion
+from cvcdepth_core.networks import DepthNetwork, PoseNet, RigImages, disparity_to_depth
+from cvcdepth_core.training.augmentation import LATERAL_AXIS, mirror, mirror_motion, mirror_rig
 from cvcdepth_core.training.batch import RigBatch
 from cvcdepth_core.training.motion import distribute_anchor_motion, distribute_vehicle_motion, motion_to_context
 from cvcdepth_core.training.objective import Prediction
 
 PoseMethod = Literal["front", "joint_front", "joint", "per_camera"]
-
-_VEHICLE_LATERAL_AXIS = 1
 
 
 class MotionVector(NamedTuple):
@@ -38,7 +36,7 @@ class SurroundModel(nn.Module):
 
     def __init__(
         self,
-        depth_net: DepthNet,
+        depth_net: DepthNetwork,
         pose_net: PoseNet,
         *,
         min_depth: float,
@@ -59,7 +57,7 @@ class SurroundModel(nn.Module):
         in training. The samples named by `depth_flips` and `pose_flips` (bool [B]) are shown mirrored to that network
         and the answer is mirrored back (Hflip-S). Under autocast only the networks run in half precision.
         """
-        disparity = self._disparity(network_frames[:, 0], depth_flips)
+        disparity = self._disparity(rig_images(batch, network_frames[:, 0]), depth_flips)
         vectors = self._motion_vectors(batch, mirror(network_frames, pose_flips))
         with torch.autocast(network_frames.device.type, enabled=False):
             depth = disparity_to_depth(
@@ -67,10 +65,9 @@ class SurroundModel(nn.Module):
             )
             return Prediction(disparity, depth, self._motions(batch, vectors, pose_flips))
 
-    def _disparity(self, images: Tensor, flips: Tensor) -> Tensor:
-        samples, cameras = images.shape[:2]
-        disparity: Tensor = self.depth_net(mirror(images, flips).flatten(0, 1)).to(images.dtype)
-        return mirror(disparity.view(samples, cameras, *disparity.shape[1:]), flips)
+    def _disparity(self, rig: RigImages, flips: Tensor) -> Tensor:
+        disparity: Tensor = self.depth_net(mirror_rig(rig, flips))
+        return mirror(disparity.to(rig.images.dtype), flips)
 
     def _motion_vectors(self, batch: RigBatch, frames: Tensor) -> list[MotionVector]:
         """Return what the pose network says for the frames -1 and +1: per sample [B, 3], or per camera [B*N, 3]."""
@@ -93,7 +90,7 @@ class SurroundModel(nn.Module):
         before, after = vectors
         raw = [motion_to_context(*before, backward=True), motion_to_context(*after, backward=False)]
         motions = torch.stack([motion.view(len(flips), -1, 4, 4) for motion in raw], dim=1)
-        motions = mirror_motion(motions, flips, _VEHICLE_LATERAL_AXIS if self.pose_method == "joint" else 0)
+        motions = mirror_motion(motions, flips, LATERAL_AXIS if self.pose_method == "joint" else 0)
         if self.pose_method == "per_camera":
             return motions
         motion = motions.squeeze(2)
@@ -101,3 +98,9 @@ class SurroundModel(nn.Module):
             anchors = distribute_vehicle_motion(motion, batch.base_T_camera)[:, :, batch.anchor]
             return distribute_vehicle_motion(motion, batch.at_exposures(anchors).base_T_camera)
         return distribute_anchor_motion(motion, batch.at_exposures(motion).base_T_camera, batch.anchor)
+
+
+def rig_images(batch: RigBatch, images: Tensor) -> RigImages:
+    """Return the batch's rig with the target `images` [B, N, 3, H, W] that the network shall see; none is absent."""
+    present = torch.ones(images.shape[:2], dtype=torch.bool, device=images.device)
+    return RigImages(images, batch.intrinsics, batch.base_T_camera, present, batch.masks)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import torch
 
 from cvcdepth_core.errors import CheckpointError
-from cvcdepth_core.networks import DepthNet, PoseNet
+from cvcdepth_core.networks import PoseNet, build_depth_network
 from cvcdepth_core.networks.checkpoint import Checkpoint, load_network_state
 from cvcdepth_core.training.config import TrainingConfig
 from cvcdepth_core.training.model import SurroundModel
@@ -16,11 +16,11 @@ def build_surround_model(config: TrainingConfig, start: Checkpoint | None = None
     """Return both networks of `config` with random weights by its seed, or with those of `start`.
 
     A checkpoint without a pose network leaves that random. Raises CheckpointError, naming the values, when `start` was
-    built for another encoder or depth range: its disparities would mean other depths.
+    built for another network, encoder or depth range: its disparities would mean other depths.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
-        depth_net, pose_net = DepthNet(config.depth.encoder), PoseNet(config.pose.encoder)
+        depth_net, pose_net = build_depth_network(config.depth), PoseNet(config.pose.encoder)
     if start is not None:
         _refuse_other_meaning(start, config)
         load_network_state(depth_net, start.depth_net, origin=f"{start.path}: depth network")
@@ -40,6 +40,7 @@ def _refuse_other_meaning(start: Checkpoint, config: TrainingConfig) -> None:
     # Depth goes with fx / focal_scale, and fx with the width: at another width, focal_scale has to follow.
     same_meaning = start.spec.focal_scale * config.depth.width / start.spec.width
     for name, found in (
+        ("network", start.spec.network),
         ("encoder", start.spec.encoder),
         ("min_depth", start.spec.min_depth),
         ("max_depth", start.spec.max_depth),

@@ -4,10 +4,9 @@
 import os
 import time
 
-import numpy as np
 import torch
 
-from cvcdepth_core.estimator import DepthEstimator
+from cvcdepth_core.estimator import SurroundDepthEstimator
 from cvcdepth_core.rig.rig import RigLayout
 from cvcdepth_ros.bags import Recording
 from cvcdepth_ros.end_to_end.processes import THREADS_VARIABLE, spared_threads
@@ -23,20 +22,18 @@ def manageable_rate(recording: Recording, layout: RigLayout, model: ModelSetting
 
     That is measured, with the node's own network on this machine; at most real time, at least a set in six seconds.
     """
-    inference = _inference_seconds(model.build_estimator(), len(layout.cameras))
+    inference = _inference_seconds(SurroundDepthEstimator(layout.complete(), model.build_estimator()))
     anchor = next(camera.image_topic for camera in layout.cameras if camera.name == layout.anchor_camera)
     seconds = (recording.end - recording.start) / NANOSECONDS
     period = seconds / max(recording.topics[anchor].count, 1)
     return min(period / min(_MARGIN * inference, _SLOWEST_SECONDS), _FASTEST)
 
 
-def _inference_seconds(estimator: DepthEstimator, cameras: int) -> float:
-    """Time the estimator on one set of grey pictures; a first run, which sets things up, does not count."""
-    pictures = [np.full((estimator.spec.height, estimator.spec.width, 3), 127, dtype=np.uint8)] * cameras
-    focal_lengths = np.full(cameras, float(estimator.spec.width))
+def _inference_seconds(surround: SurroundDepthEstimator) -> float:
+    """Time the estimator on one black set; a first run, which sets things up, does not count."""
     if THREADS_VARIABLE not in os.environ:
         torch.set_num_threads(spared_threads())
-    estimator.estimate(pictures, focal_lengths)
+    surround.warm_up()
     began = time.monotonic()
-    estimator.estimate(pictures, focal_lengths)
+    surround.warm_up()
     return time.monotonic() - began

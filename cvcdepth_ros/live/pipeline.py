@@ -11,17 +11,18 @@ import queue
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, wait
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
 
 from cvcdepth_core.errors import CvcDepthError, EngineError, ImageError
-from cvcdepth_core.estimator import DepthPredictor, PictureSize, SurroundDepth, SurroundDepthEstimator
+from cvcdepth_core.estimator import DepthPredictor, PictureSize, SurroundDepthEstimator
 from cvcdepth_core.images.decoding import Picture
 from cvcdepth_core.images.rectifier import Rectifier, SurroundPreprocessor
 from cvcdepth_core.rig.rig import Rig
+from cvcdepth_core.surround_depth import SurroundDepth
 from cvcdepth_ros.live.camera_states import CameraWatch
 from cvcdepth_ros.live.mailbox import Mailbox
 from cvcdepth_ros.live.picture_preparation import CameraImage, PicturePreparer
@@ -157,10 +158,10 @@ class SurroundPipeline:
 
     def _prepare_ahead(self, image: CameraImage) -> None:
         build = self._build
-        if build is None or not build.done() or not self._wanted(image.camera):
+        surround = _surround_of(build) if build is not None and build.done() else None
+        if surround is None or not self._needed([image.camera], surround):
             return
-        surround = _surround_of(build)
-        rectifier = surround.preprocessor.rectifiers.get(image.camera) if surround is not None else None
+        rectifier = surround.preprocessor.rectifiers.get(image.camera)
         # An image whose set will be replaced before the network is free need not be decoded.
         if rectifier is not None and self._pace.is_free_within(self._watches[image.camera].interval):
             self._preparer.prepare(image, rectifier)
@@ -224,19 +225,29 @@ class SurroundPipeline:
             return
         rectifiers = surround.preprocessor.rectifiers
         images = {name: image for name, image in surround_set.images.items() if name in rectifiers}
-        wanted = {name: image for name, image in images.items() if self._wanted(name)}
-        for name in images.keys() - wanted.keys():
+        needed = {name: images[name] for name in self._needed(images, surround)}
+        for name in images.keys() - needed.keys():
             self._watches[name].used("")  # nothing is known against an image that nobody looks at
-        if not wanted:
+        if not needed:
             self.counters["skipped: no subscriber"] += 1
             return
         received = [image.received for image in surround_set.images.values()]
         self._latencies.record("wait for set", max(received) - min(received))
         self._latencies.record("wait for inference", time.monotonic() - max(received))
-        pictures = self._pictures(wanted, rectifiers, len(images))
+        pictures = self._pictures(needed, rectifiers, len(images))
         with self._latencies.measure("inference"), self._pace.measured():
             depth = surround.estimate([pictures.get(name) for name in rectifiers])
         self._estimates.put(PublishedSet(surround_set, surround.rig, depth))
+
+    def _needed(self, cameras: Iterable[str], surround: SurroundDepthEstimator) -> list[str]:
+        """Return which of the cameras' pictures the network needs for the depth that is wanted.
+
+        One that looks at all cameras together must see them all for any: whoever subscribes to one camera gets what
+        whoever subscribes to all gets.
+        """
+        if surround.estimator.independent:
+            return [name for name in cameras if self._wanted(name)]
+        return list(cameras) if any(map(self._wanted, self._watches)) else []
 
     def _usable_surround(self) -> SurroundDepthEstimator | None:
         """Wait for the rig that was set; None where there is none, or it cannot be used."""
@@ -247,11 +258,11 @@ class SurroundPipeline:
         return surround
 
     def _pictures(
-        self, wanted: Mapping[str, CameraImage], rectifiers: Mapping[str, Rectifier], cameras: int
+        self, needed: Mapping[str, CameraImage], rectifiers: Mapping[str, Rectifier], cameras: int
     ) -> dict[str, Picture]:
-        """Return the wanted pictures that can be made; ImageError when fewer of `cameras` are left than a set needs."""
+        """Return the needed pictures that can be made; ImageError when fewer of `cameras` are left than a set needs."""
         with self._latencies.measure("wait for pictures"):
-            outcomes = self._preparer.pictures(wanted, rectifiers)
+            outcomes = self._preparer.pictures(needed, rectifiers)
         for name, outcome in outcomes.items():
             self._watches[name].used(str(outcome) if isinstance(outcome, ImageError) else "")
         return usable_pictures(outcomes, cameras, self._synchroniser.required)

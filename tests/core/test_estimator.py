@@ -4,7 +4,7 @@ import pytest
 from recordings import SAMPLE
 
 from cvcdepth_core.estimator import DepthEstimator, SurroundDepthEstimator
-from cvcdepth_core.networks.checkpoint import DepthModelSpec
+from cvcdepth_core.networks.registry import DepthModelSpec
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.recordings.rig import discover_rig
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from scenes import random_batch
 
-from cvcdepth_core.networks.checkpoint import DepthModelSpec
+from cvcdepth_core.networks.registry import DepthModelSpec
 from cvcdepth_core.training.batch import RigBatch
 from cvcdepth_core.training.config import OptimizerConfig, PoseConfig, TrainingConfig
 from cvcdepth_core.training.distributed import Processes, launched_processes

@@ -15,7 +15,8 @@ import recordings
 from recordings import SAMPLE, SAMPLE_MCAP
 
 from cvcdepth_core.networks import DepthNet
-from cvcdepth_core.networks.checkpoint import DepthModelSpec, save_checkpoint
+from cvcdepth_core.networks.checkpoint import save_checkpoint
+from cvcdepth_core.networks.registry import DepthModelSpec
 from cvcdepth_ros.bag_replay import COMMANDS, build_parser, main
 
 PROGRAM = (sys.executable, "-m", "cvcdepth_ros.bag_replay")

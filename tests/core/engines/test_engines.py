@@ -14,16 +14,19 @@ from torch import Tensor, nn
 
 from cvcdepth_core.engines import BACKENDS, Precision, build_engine, is_installed, selection
 from cvcdepth_core.engines.engine import DeviceMemoryError
+from cvcdepth_core.engines.example_rigs import ring_of_cameras
 from cvcdepth_core.engines.guarded_engine import GuardedEngine
 from cvcdepth_core.engines.ncnn_graph import ncnn_model
-from cvcdepth_core.engines.parity import check_parity, relative_depth_error, street_like_picture
+from cvcdepth_core.engines.parity import check_parity, relative_depth_error
 from cvcdepth_core.engines.rewriting import RewrittenDepthNet
 from cvcdepth_core.engines.torch_engine import MixedPrecision, PaddedBatches, TorchEagerEngine, TorchEngine
 from cvcdepth_core.errors import ConfigError, EngineError
 from cvcdepth_core.estimator import DepthEstimator
 from cvcdepth_core.images.rectifier import to_tensor
-from cvcdepth_core.networks import ENCODERS, DepthNet, disparity_to_depth
-from cvcdepth_core.networks.checkpoint import DepthModelSpec, save_checkpoint
+from cvcdepth_core.networks import ENCODERS, DepthNet, RigImages, disparity_to_depth
+from cvcdepth_core.networks.checkpoint import save_checkpoint
+from cvcdepth_core.networks.registry import DepthModelSpec
+from cvcdepth_core.surround_depth import SurroundPictures
 from cvcdepth_ros.bag_replay import main
 from cvcdepth_ros.settings import ModelSettings
 
@@ -66,13 +69,27 @@ def random_pictures(count: int) -> list[np.ndarray]:
     return list(rng.integers(0, 256, (count, HEIGHT, WIDTH, 3), dtype=np.uint8))
 
 
+def surround_of(pictures: list[np.ndarray], fx: np.ndarray | None = None) -> SurroundPictures:
+    """One set, all of whose cameras are present; an independent network asks for fx alone."""
+    count = len(pictures)
+    intrinsics = np.tile(np.eye(3), (count, 1, 1))
+    intrinsics[:, 0, 0] = 60.0 if fx is None else fx
+    valid, mounts = np.ones((count, HEIGHT, WIDTH), bool), np.tile(np.eye(4), (count, 1, 1))
+    return SurroundPictures(np.stack(pictures), np.ones(count, bool), intrinsics, mounts, valid)
+
+
+def rig_of(images: Tensor) -> RigImages:
+    rig = RigImages.from_pictures(surround_of(random_pictures(len(images))))
+    return rig._replace(images=images[None])
+
+
 @pytest.mark.parametrize("transposed", [True, False])
 @pytest.mark.parametrize("encoder", ENCODERS)
 @torch.inference_mode()
 def test_the_rewritten_network_is_the_network(encoder: str, transposed: bool):
     network = lively_network(encoder)
     images = random_images(2).double()
-    exact = network.double()(images)
+    exact = network.double().disparity(images)
     assert exact.std() > 0.001
     rewritten = RewrittenDepthNet(network, transposed)
     torch.testing.assert_close(rewritten(images), exact, rtol=1e-10, atol=1e-12)
@@ -91,7 +108,7 @@ def test_the_rewritten_network_neither_normalises_nor_stretches_nor_joins(encode
 
 def operations_of(network: nn.Module) -> list:
     with torch.inference_mode(), torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
-        network(random_images(1))
+        getattr(network, "disparity", network)(random_images(1))
     return list(profile.key_averages())
 
 
@@ -109,16 +126,16 @@ def test_every_engine_gives_the_depth_of_float64(backend: str, encoder: str):
     network, spec = lively_network(encoder), spec_of(encoder)
     engine = selection.checked_engine(network, spec, CPU, backend, "float32")
     assert backend in engine.name
-    assert relative_depth_error(engine, network, spec, random_pictures(1)[0]) < 1e-4
+    assert relative_depth_error(engine, network, spec, rig_of(random_images(1))) < 1e-4
 
 
 @pytest.mark.parametrize("backend", CPU_BACKENDS)
 def test_a_cameras_depth_does_not_depend_on_the_other_cameras(backend: str):
     estimator = DepthEstimator(lively_network("resnet18"), spec_of("resnet18"), "random", "cpu", backend)
     pictures, fx = random_pictures(3), np.array([60.0, 70.0, 80.0])
-    together = estimator.estimate(pictures, fx)
-    alone = [estimator.estimate([picture], fx[[index]])[0] for index, picture in enumerate(pictures)]
-    reversed_order = estimator.estimate(pictures[::-1], fx[::-1].copy())[::-1]
+    together = estimator.estimate(surround_of(pictures, fx))
+    alone = [estimator.estimate(surround_of([picture], fx[[index]]))[0] for index, picture in enumerate(pictures)]
+    reversed_order = estimator.estimate(surround_of(pictures[::-1], fx[::-1]))[::-1]
     assert together.dtype == np.float32
     assert np.array_equal(together, np.stack(alone))
     assert np.array_equal(together, reversed_order)
@@ -129,8 +146,8 @@ class WrongEngine(TorchEagerEngine):
 
     factor = 1.002
 
-    def disparity(self, images: Tensor) -> Tensor:
-        return super().disparity(images) * self.factor
+    def disparity(self, rig: RigImages) -> Tensor:
+        return super().disparity(rig) * self.factor
 
 
 @pytest.mark.parametrize("factor", [1.002, 0.99, float("nan")])
@@ -138,7 +155,7 @@ def test_an_engine_that_gives_another_depth_is_refused_with_the_numbers(factor: 
     network, spec = lively_network("resnet18"), spec_of("resnet18")
     engine = WrongEngine(network, CPU)
     engine.factor = factor
-    found = relative_depth_error(engine, network, spec, street_like_picture(HEIGHT, WIDTH))
+    found = relative_depth_error(engine, network, spec, ring_of_cameras(HEIGHT, WIDTH).of_cameras([0]))
     with pytest.raises(EngineError, match=rf"torch_eager .* is {found:.2e} at the 99.9th percentile .* at most 0.001"):
         check_parity(engine, network, spec, "float32")
 
@@ -191,11 +208,12 @@ class FaultyDevice:
     def __init__(self, room: int, error: Exception) -> None:
         self.room, self.error, self.tried = room, error, []
 
-    def disparity(self, images: Tensor) -> Tensor:
-        self.tried.append(len(images))
-        if len(images) > self.room:
+    def disparity(self, rig: RigImages) -> Tensor:
+        cameras = rig.images.shape[1]
+        self.tried.append(cameras)
+        if cameras > self.room:
             raise self.error
-        return images[:, :1]
+        return rig.images[:, :, :1]
 
 
 NO_ROOM = DeviceMemoryError("no room\nat all")
@@ -205,11 +223,11 @@ LOST = RuntimeError("CUDA error: unspecified launch failure\nCompile with TORCH_
 @pytest.mark.parametrize("error", [NO_ROOM, torch.cuda.OutOfMemoryError()])
 def test_with_little_memory_cameras_go_in_smaller_chunks_and_stay_there(error: Exception):
     small = FaultyDevice(2, error)
-    engine = GuardedEngine(small)
-    assert engine.disparity(random_pictures(6)).shape == (6, 1, HEIGHT, WIDTH)
+    engine = GuardedEngine(small, independent=True)
+    assert engine.disparity(surround_of(random_pictures(6))).shape == (6, 1, HEIGHT, WIDTH)
     assert small.tried == [6, 3, 1, 1, 1, 1, 1, 1]
     small.tried.clear()
-    engine.disparity(random_pictures(2))
+    engine.disparity(surround_of(random_pictures(2)))
     assert small.tried == [1, 1]
 
 
@@ -224,43 +242,43 @@ def test_with_little_memory_cameras_go_in_smaller_chunks_and_stay_there(error: E
 )
 def test_a_device_that_fails_stops_with_the_reason(error: Exception, reason: str):
     with pytest.raises(EngineError) as found:
-        GuardedEngine(FaultyDevice(0, error)).disparity(random_pictures(3))
+        GuardedEngine(FaultyDevice(0, error), independent=True).disparity(surround_of(random_pictures(3)))
     assert str(found.value) == reason
 
 
 @pytest.mark.parametrize("error", [NO_ROOM, LOST])
 def test_where_that_is_wanted_the_cpu_takes_over_for_good(error: Exception):
     network, faulty = lively_network("resnet18"), FaultyDevice(0, error)
-    engine = GuardedEngine(faulty, fallback=lambda: TorchEagerEngine(network, CPU))
+    engine = GuardedEngine(faulty, independent=True, fallback=lambda: TorchEagerEngine(network, CPU))
     pictures = random_pictures(2)
     with torch.inference_mode():
-        expected = torch.cat([network(to_tensor([picture])) for picture in pictures])
-    assert torch.equal(engine.disparity(pictures), expected)
+        expected = torch.cat([network.disparity(to_tensor([picture])) for picture in pictures])
+    assert torch.equal(engine.disparity(surround_of(pictures)), expected)
     assert engine.name.startswith("torch_eager")
     faulty.tried.clear()
-    engine.disparity(pictures)
+    engine.disparity(surround_of(pictures))
     assert not faulty.tried
 
 
 @pytest.mark.parametrize("error", [NO_ROOM, LOST])
 def test_a_fallback_that_fails_too_is_an_error(error: Exception):
-    engine = GuardedEngine(FaultyDevice(0, error), fallback=lambda: FaultyDevice(0, error))
+    engine = GuardedEngine(FaultyDevice(0, error), independent=True, fallback=lambda: FaultyDevice(0, error))
     with pytest.raises(EngineError, match=r"out of memory|launch failure"):
-        engine.disparity(random_pictures(2))
+        engine.disparity(surround_of(random_pictures(2)))
 
 
 def test_a_compiled_network_sees_few_sizes_of_batch_while_cameras_come_and_go():
-    network, seen = TorchEagerEngine(lively_network("resnet18"), CPU), []
+    network, seen = torch.inference_mode()(lively_network("resnet18").disparity), []
 
     def compiled(images: Tensor) -> Tensor:
         seen.append(len(images))
-        return network.disparity(images)
+        return network(images)
 
     padded, images = PaddedBatches(compiled), random_images(6)
     for count in (6, 5, 4, 3, 2, 1, 6):
         given = padded(images[:count])
         assert len(given) == count
-        torch.testing.assert_close(given, network.disparity(images[:count]))
+        torch.testing.assert_close(given, network(images[:count]))
     assert seen == [6, 6, 6, 6, 2, 2, 6]
 
 
@@ -286,8 +304,8 @@ def test_ncnn_gives_the_same_depth_on_any_number_of_threads(monkeypatch: pytest.
     for threads in (1, 4):
         monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
         engine = build_engine(lively_network("resnet18"), spec_of("resnet18"), "cpu", "ncnn")
-        one_by_one = torch.cat([engine.disparity([picture]) for picture in pictures])
-        found += [one_by_one, engine.disparity(pictures), engine.disparity(pictures[:2])]
+        one_by_one = torch.cat([engine.disparity(surround_of([picture])) for picture in pictures])
+        found += [one_by_one, engine.disparity(surround_of(pictures)), engine.disparity(surround_of(pictures[:2]))]
     assert all(torch.equal(disparity, found[0][: len(disparity)]) for disparity in found)
 
 
@@ -322,7 +340,7 @@ def test_an_exported_model_takes_any_number_and_size_of_pictures():
     images = torch.rand(3, 3, 96, 160, generator=torch.Generator().manual_seed(1))
     (disparity,) = session.run(["disparity"], {"images": images.numpy()})
     with torch.inference_mode():
-        np.testing.assert_allclose(disparity, network(images).numpy(), rtol=1e-4)
+        np.testing.assert_allclose(disparity, network.disparity(images).numpy(), rtol=1e-4)
 
 
 def test_the_settings_offer_the_backends_and_precisions_that_there_are():
@@ -338,10 +356,10 @@ def test_cuda_engines_pass_the_parity_check(backend: str, precision: Precision):
     network = lively_network("resnet18").cuda()
     engine = build_engine(network, spec_of("resnet18"), "cuda", backend, precision)
     pictures = random_pictures(6)
-    first = engine.disparity(pictures)
+    first = engine.disparity(surround_of(pictures))
     kept = first.clone()
     with ThreadPoolExecutor(1) as another_thread:
-        again = another_thread.submit(engine.disparity, pictures[::-1]).result()
+        again = another_thread.submit(engine.disparity, surround_of(pictures[::-1])).result()
     torch.testing.assert_close(again.flip(0), first, rtol=1e-2, atol=1e-3)
     assert torch.equal(first, kept)  # a CUDA graph's own memory would have changed
 

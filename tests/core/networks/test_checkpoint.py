@@ -12,7 +12,6 @@ from safetensors.torch import save_file
 from cvcdepth_core.errors import CheckpointError, OutputError
 from cvcdepth_core.networks import DepthNet, PoseNet
 from cvcdepth_core.networks.checkpoint import (
-    DepthModelSpec,
     check_sha256,
     import_released,
     load_checkpoint,
@@ -20,6 +19,7 @@ from cvcdepth_core.networks.checkpoint import (
     load_network_state,
     save_checkpoint,
 )
+from cvcdepth_core.networks.registry import DepthModelSpec
 
 SPEC = DepthModelSpec(height=384, width=640, min_depth=1.5, max_depth=200)
 
@@ -46,7 +46,7 @@ def test_a_checkpoint_comes_back_as_it_was_written(checkpoint, depth_net, pose_n
     assert (loaded.spec, loaded.metadata, loaded.path) == (SPEC, {"command": "finetune"}, checkpoint)
     assert loaded.sha256 == hashlib.sha256(checkpoint.read_bytes()).hexdigest()
     image = torch.rand(1, 3, 64, 64)
-    torch.testing.assert_close(loaded.build_depth_net()(image), depth_net(image), rtol=0, atol=0)
+    torch.testing.assert_close(loaded.build_depth_net().disparity(image), depth_net.disparity(image), rtol=0, atol=0)
     assert all(torch.equal(value, loaded.pose_net[key]) for key, value in pose_net.state_dict().items())
     assert [path.name for path in checkpoint.parent.iterdir()] == [checkpoint.name]
 
@@ -162,7 +162,7 @@ def test_released_weights_are_imported_and_can_be_saved_as_a_checkpoint(released
     save_checkpoint(tmp_path / "imported.safetensors", SPEC, imported.depth_net, imported.pose_net)
     image = torch.rand(1, 3, 64, 64)
     network = load_checkpoint(tmp_path / "imported.safetensors").build_depth_net()
-    torch.testing.assert_close(network(image), depth_net(image), rtol=0, atol=0)
+    torch.testing.assert_close(network.disparity(image), depth_net.disparity(image), rtol=0, atol=0)
     PoseNet().load_state_dict(imported.pose_net)
 
 

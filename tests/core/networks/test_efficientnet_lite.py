@@ -89,7 +89,7 @@ def test_the_features_halve_the_input_five_times_with_the_announced_widths():
 
 def test_both_networks_take_the_encoder_and_train_all_of_it():
     depth_net, pose_net = DepthNet("efficientnet_lite0"), PoseNet("efficientnet_lite0")
-    disparity = depth_net(torch.rand(2, 3, 64, 96))
+    disparity = depth_net.disparity(torch.rand(2, 3, 64, 96))
     axis_angle, translation = pose_net(torch.rand(2, 1, 3, 64, 96), torch.rand(2, 1, 3, 64, 96))
     assert disparity.shape == (2, 1, 64, 96)
     (disparity.square().sum() + axis_angle.sum() + translation.square().sum()).backward()

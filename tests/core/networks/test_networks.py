@@ -20,7 +20,7 @@ def test_networks_have_the_published_number_of_parameters(encoder, depth, pose):
 def test_depth_network_gives_one_disparity_per_pixel_at_any_multiple_of_32(train):
     network = DepthNet().train(train)
     for height, width in ((64, 96), (96, 64)):
-        disparity = network(torch.rand(2, 3, height, width))
+        disparity = network.disparity(torch.rand(2, 3, height, width))
         assert disparity.shape == (2, 1, height, width)
         assert 0 < float(disparity.detach().min()) <= float(disparity.detach().max()) < 1
 
@@ -28,7 +28,7 @@ def test_depth_network_gives_one_disparity_per_pixel_at_any_multiple_of_32(train
 @pytest.mark.parametrize(("height", "width"), [(380, 640), (384, 650), (32, 64)])
 def test_an_input_of_a_size_that_does_not_fit_is_refused_with_that_size(height, width):
     with pytest.raises(ImageError, match=rf"{width}x{height} .* multiples of 32 and at least 64"):
-        DepthNet()(torch.rand(1, 3, height, width))
+        DepthNet().disparity(torch.rand(1, 3, height, width))
 
 
 @pytest.mark.parametrize("network", [DepthNet, PoseNet])

@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from recordings import SAMPLE
@@ -53,8 +55,9 @@ def test_the_ground_agrees_between_all_neighbours_and_a_constant_does_not(rig):
 
 def test_a_predictor_made_for_another_calibration_is_refused(rig):
     predictor = ground_plane_depth(rig, height=96, width=160)
+    other = replace(rig.cameras[0], calibration=rig.cameras[1].calibration)
     with pytest.raises(ConfigError, match="made for fx"):
-        predictor.estimate([np.zeros((96, 160, 3), np.uint8)] * 6, np.full(6, 100.0))
+        estimate(replace(rig, cameras=(other, *rig.cameras[1:])), predictor)
 
 
 def test_impossible_references_are_refused(rig):

@@ -9,16 +9,18 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mean_feature_network import MeanFeatureNet
 from scenes import PlaneScene, passed_plane, random_batch, random_prediction, ring_neighbours, slanted_plane
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
 
 from cvcdepth_core.errors import ImageError, RigError
-from cvcdepth_core.networks import DepthNet, PoseNet
+from cvcdepth_core.networks import DepthNet, PoseNet, RigImages
 from cvcdepth_core.rendering.projection import back_project, rigid
 from cvcdepth_core.rendering.view_synthesis import sample, sampling_grid
+from cvcdepth_core.training.augmentation import mirror_rig
 from cvcdepth_core.training.batch import RigBatch
-from cvcdepth_core.training.model import SurroundModel
+from cvcdepth_core.training.model import SurroundModel, rig_images
 from cvcdepth_core.training.motion import distribute_anchor_motion, relative_poses
 from cvcdepth_core.training.objective import ObjectiveConfig, Prediction, evaluate_objective, synthesise_views
 
@@ -339,6 +341,28 @@ def test_mirrored_samples_come_back_in_place_and_leave_the_others_alone():
     torch.testing.assert_close(some.disparity[0], plain.disparity[0])
     assert not torch.allclose(some.disparity[1], plain.disparity[1], atol=1e-6)
     torch.testing.assert_close(some.motions, plain.motions)
+
+
+def test_a_network_that_looks_at_the_rig_sees_a_flipped_sample_as_the_mirrored_world():
+    batch = random_batch(samples=2, cameras=3, height=64, width=64).to(dtype=torch.float32)
+    seen: list[RigImages] = []
+
+    class Watching(MeanFeatureNet):
+        def forward(self, rig: RigImages) -> torch.Tensor:
+            seen.append(rig)
+            return super().forward(rig)
+
+    model = SurroundModel(Watching("resnet18"), PoseNet(), min_depth=1.5, max_depth=80).eval()
+    none, second = torch.tensor([False, False]), torch.tensor([False, True])
+    prediction = model(batch, batch.frames, second, none)
+    plain = rig_images(batch, batch.images)
+    for one, expected, before in zip(seen[0], mirror_rig(plain, second), plain, strict=True):
+        assert torch.equal(one, expected)
+        assert torch.equal(one[0], before[0])
+    assert not torch.equal(seen[0].base_T_camera[1], batch.base_T_camera[1])
+    torch.testing.assert_close(prediction.disparity[1], model.depth_net(seen[0])[1].flip(-1))
+    evaluate_objective(batch, prediction, ALL_TERMS).loss.backward()
+    assert all(parameter.grad.isfinite().all() for parameter in model.depth_net.parameters())
 
 
 def test_half_precision_stays_within_the_networks():

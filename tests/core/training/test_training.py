@@ -18,7 +18,8 @@ from scenes import random_batch
 
 from cvcdepth_core.errors import CheckpointError, ConfigError, OutputError, TrainingError
 from cvcdepth_core.networks import DepthNet
-from cvcdepth_core.networks.checkpoint import DepthModelSpec, load_checkpoint, save_checkpoint
+from cvcdepth_core.networks.checkpoint import load_checkpoint, save_checkpoint
+from cvcdepth_core.networks.registry import DepthModelSpec
 from cvcdepth_core.training.config import OptimizerConfig, PoseConfig, TrainingConfig
 from cvcdepth_core.training.starting_model import build_surround_model
 from cvcdepth_core.training.trainer import Trainer, ValidationOutcome

@@ -25,7 +25,8 @@ from rosbags.highlevel import AnyReader
 from s3_server import LocalS3
 
 from cvcdepth_core.networks import DepthNet
-from cvcdepth_core.networks.checkpoint import DepthModelSpec, save_checkpoint
+from cvcdepth_core.networks.checkpoint import save_checkpoint
+from cvcdepth_core.networks.registry import DepthModelSpec
 from cvcdepth_core.scoring.references import FixedDepth
 from cvcdepth_ros.bag_replay import main
 from cvcdepth_ros.commands import arguments

@@ -18,7 +18,8 @@ from repository import ROOT
 
 from cvcdepth_core.errors import ConfigError
 from cvcdepth_core.networks import DepthNet
-from cvcdepth_core.networks.checkpoint import DepthModelSpec, save_checkpoint
+from cvcdepth_core.networks.checkpoint import save_checkpoint
+from cvcdepth_core.networks.registry import DepthModelSpec
 from cvcdepth_ros.bag_replay import main
 from cvcdepth_ros.evaluation.cluster import ray_pool
 from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings

@@ -12,12 +12,14 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from mean_feature_network import register
 from recordings import CAMERAS, SAMPLE
 
 from cvcdepth_core.errors import EngineError, ImageError
 from cvcdepth_core.estimator import DepthEstimator, SurroundDepthEstimator
 from cvcdepth_core.images.rectifier import Rectifier
-from cvcdepth_core.networks.checkpoint import DepthModelSpec
+from cvcdepth_core.networks import DepthModelSpec, build_depth_network
+from cvcdepth_core.surround_depth import SurroundPictures
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.live.camera_states import CameraState, CameraWatch
 from cvcdepth_ros.live.mailbox import Mailbox
@@ -58,7 +60,7 @@ class Slowed:
     """A depth predictor that waits until it is told to go on, but not with the black pictures that warm it up."""
 
     def __init__(self, predictor: DepthEstimator) -> None:
-        self.spec, self.model_id = predictor.spec, predictor.model_id
+        self.spec, self.model_id, self.independent = predictor.spec, predictor.model_id, predictor.independent
         self._predictor = predictor
         self.gate = threading.Event()
         self.entered = threading.Event()
@@ -67,15 +69,15 @@ class Slowed:
         self.cameras: list[int] = []
         self.warmed_up: list[int] = []
 
-    def estimate(self, pictures: Any, fx: Any) -> Any:
-        if not np.any(pictures):
-            self.warmed_up.append(len(pictures))
+    def estimate(self, surround: SurroundPictures) -> Any:
+        if not np.any(surround.pictures):
+            self.warmed_up.append(int(surround.present.sum()))
             assert self.warm_up_gate.wait(TIMEOUT)
-            return self._predictor.estimate(pictures, fx)
-        self.cameras.append(len(pictures))
+            return self._predictor.estimate(surround)
+        self.cameras.append(int(surround.present.sum()))
         self.entered.set()
         assert self.gate.wait(TIMEOUT)
-        return self._predictor.estimate(pictures, fx)
+        return self._predictor.estimate(surround)
 
 
 class Running:
@@ -134,6 +136,26 @@ def test_what_comes_out_is_what_the_bag_tool_computes_to_the_bit(start, estimato
     expected = estimate_set(messages, surround, StageLatencies(), required=6)
     np.testing.assert_array_equal(first.depth.depth, expected.depth)
     np.testing.assert_array_equal(first.depth.pictures, expected.pictures)
+
+
+def test_a_network_that_looks_at_all_cameras_gives_one_subscriber_what_it_gives_to_all(
+    start, layout, images, monkeypatch
+):
+    spec = register(monkeypatch)
+    predictor = DepthEstimator(build_depth_network(spec), spec, "toy", "cpu", "torch_eager")
+    depth = []
+    for wanted in (set(layout.names), {"left"}):
+        running = start(predictor)
+        running.wanted = wanted
+        running.feed(images[:12])
+        running.wait(lambda running=running: running.published)
+        depth.append(running.published[0].depth)
+    assert all(one.present.all() for one in depth)
+    np.testing.assert_array_equal(depth[0].depth, depth[1].depth)
+    nobody = start(predictor)
+    nobody.wanted = set()
+    nobody.feed(images[:12])
+    nobody.wait(lambda: nobody.pipeline.counters["skipped: no subscriber"])
 
 
 def test_the_network_is_warmed_up_once_and_not_with_a_real_set(start, estimator, layout, images):
@@ -312,9 +334,9 @@ class Failing:
     """A depth predictor whose device has failed."""
 
     def __init__(self, predictor: DepthEstimator) -> None:
-        self.spec, self.model_id = predictor.spec, predictor.model_id
+        self.spec, self.model_id, self.independent = predictor.spec, predictor.model_id, predictor.independent
 
-    def estimate(self, pictures: Any, fx: Any) -> Any:
+    def estimate(self, surround: SurroundPictures) -> Any:
         raise EngineError("torch on cuda: out of memory with a single picture")
 
 

@@ -15,7 +15,7 @@ from recordings import CAMERAS, JAZZY, SAMPLE, Entry, changed, cut, restamped, s
 
 from cvcdepth_core.errors import RecordingError, RigError
 from cvcdepth_core.images.rectifier import SurroundPreprocessor
-from cvcdepth_core.networks.checkpoint import DepthModelSpec
+from cvcdepth_core.networks.registry import DepthModelSpec
 from cvcdepth_core.training.config import OptimizerConfig, RecordingsConfig, TrainingConfig
 from cvcdepth_core.training.distributed import Processes
 from cvcdepth_ros.bags import open_recording

@@ -25,7 +25,8 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from std_msgs.msg import Header
 
 from cvcdepth_core.networks import DepthNet
-from cvcdepth_core.networks.checkpoint import DepthModelSpec, save_checkpoint
+from cvcdepth_core.networks.checkpoint import save_checkpoint
+from cvcdepth_core.networks.registry import DepthModelSpec
 
 SMALL = {"untrained": True, "height": 96, "width": 160, "max_age": 0.0}
 FIRING_ORDER = ("back", "left", "front_left", "front", "front_right", "right")

@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The seam between a rig and its depth network: what every depth network takes and declares."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from cvcdepth_core.images.rectifier import to_tensor
+from cvcdepth_core.surround_depth import SurroundPictures
+
+
+class RigImages(NamedTuple):
+    """B surround sets of one rig's N cameras as a depth network takes them.
+
+    A camera that is dead is `present = False`, never a missing row: its calibration still says where it looks.
+    """
+
+    images: Tensor
+    """[B, N, 3, H, W] in [0, 1]; black where the camera is absent."""
+    intrinsics: Tensor
+    """[B, N, 3, 3] in pixels of H x W, pixel centres at the integers."""
+    base_T_camera: Tensor
+    """[B, N, 4, 4] camera (optical frame) to vehicle, metres."""
+    present: Tensor
+    """[B, N] bool."""
+    masks: Tensor
+    """[B, N, 1, H, W] in [0, 1], 1 = the picture shows the scene, 0 = the vehicle itself or nothing."""
+
+    @classmethod
+    def from_pictures(
+        cls, surround: SurroundPictures, cameras: Any = slice(None), device: torch.device | str = "cpu"
+    ) -> RigImages:
+        """Return the `cameras` (an index into N) of one set, B = 1, float32 on `device`."""
+        return cls(
+            to_tensor(surround.pictures[cameras], device)[None],
+            _float32(surround.intrinsics[cameras], device),
+            _float32(surround.base_T_camera[cameras], device),
+            torch.from_numpy(surround.present[cameras]).to(device)[None],
+            _float32(surround.valid[cameras, None], device),
+        )
+
+    def of_cameras(self, cameras: Sequence[int]) -> RigImages:
+        """Return these cameras alone, as if there were no others."""
+        return RigImages(*(part[:, list(cameras)] for part in self))
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> RigImages:
+        """Return them on `device`, with floating-point tensors of `dtype`."""
+        return RigImages(*(part.to(device, dtype if part.is_floating_point() else None) for part in self))
+
+
+class DepthNetwork(nn.Module, ABC):
+    """A network that gives depth for all cameras of a rig; a checkpoint's `network` names its class.
+
+    A module, not only something with this `forward`: engines copy it, move it, and change its precision.
+    """
+
+    independent: ClassVar[bool]
+    """Whether a camera's depth depends on no other camera's image or presence: then cameras may be left out and run in
+    chunks, and one that nobody wants need not be computed."""
+    engines: ClassVar[tuple[str, ...]]
+    """The backends that can run it, the one that `auto` takes first where it is installed at the front."""
+
+    @abstractmethod
+    def forward(self, rig: RigImages) -> Tensor:
+        """Return the disparity [B, N, 1, H, W] in (0, 1); that of absent cameras means nothing."""
+
+
+def _float32(array: np.ndarray[Any, Any], device: torch.device | str) -> Tensor:
+    return torch.from_numpy(array.astype(np.float32))[None].to(device)
