@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -94,7 +95,7 @@ def test_a_run_killed_at_any_moment_resumes_to_the_weights_of_an_uninterrupted_o
         "run.save = lambda: (save(), print(run.progress.step, flush=True))\n"
         "run.train(quiet=True)\n"
     )
-    folders = f"{ROOT / 'tests' / 'support'}:{ROOT}"
+    folders = f"{Path(__file__).parent}:{ROOT / 'tests' / 'support'}:{ROOT}"
     process = subprocess.Popen(
         [sys.executable, "-c", script, tmp_path], stdout=subprocess.PIPE, text=True, env={"PYTHONPATH": folders}
     )
