@@ -23,6 +23,16 @@ EXAMPLES: tuple[str, ...] = (
     "export model.safetensors --tensorrt --precision float16",
 )
 
+_ONE_IMAGE = {
+    "input": "images [B, 3, H, W], float32 RGB in [0, 1], rectified; H and W multiples of 32",
+    "output": "disparity [B, 1, H, W], float32 in (0, 1)",
+}
+_WHOLE_RIG = {
+    "input": "images [1, N, 3, H, W], float32 RGB in [0, 1], rectified; and what else the network looks at: intrinsics "
+    "[1, N, 3, 3] float32 in pixels of H x W, base_T_camera [1, N, 4, 4] float32 in metres, present [1, N] bool, "
+    "masks [1, N, 1, H, W] float32, 1 = scene",
+    "output": "disparity [1, N, 1, H, W], float32 in (0, 1)",
+}
 _DEPTH = "depth = fx / (focal_scale * (1 / max_depth + (1 / min_depth - 1 / max_depth) * disparity))"
 
 
@@ -81,13 +91,14 @@ def _build_tensorrt(
 
 def _description(checkpoint: "Checkpoint") -> dict[str, Any]:
     """Say what a program needs to use the model."""
+    from cvcdepth_core.networks.registry import PER_CAMERA
+
     return {
         "version": package_version(),
         "checkpoint": checkpoint.path.name,
         "sha256": checkpoint.sha256,
         **checkpoint.spec.model_dump(),
-        "input": "images [B, 3, H, W], float32 RGB in [0, 1], rectified; H and W multiples of 32",
-        "output": "disparity [B, 1, H, W], float32 in (0, 1)",
+        **(_ONE_IMAGE if checkpoint.spec.network == PER_CAMERA else _WHOLE_RIG),
         "depth": _DEPTH,
         "fx": "each camera's focal length in pixels of H x W; depth is metres along the optical axis",
     }

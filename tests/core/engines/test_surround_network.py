@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A network that looks at all cameras together, through every engine and estimator: never camera by camera."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +18,7 @@ from cvcdepth_core.estimator import DepthEstimator
 from cvcdepth_core.networks import DepthModelSpec, RigImages, build_depth_network, disparity_to_depth
 from cvcdepth_core.networks.checkpoint import load_checkpoint, save_checkpoint
 from cvcdepth_core.surround_depth import SurroundPictures
+from cvcdepth_ros.bag_replay import main
 
 HEIGHT, WIDTH = SPEC_FIELDS["height"], SPEC_FIELDS["width"]
 OTHERS = [name for name in BACKENDS if name not in (*MeanFeatureNet.engines, "auto")]
@@ -142,6 +144,34 @@ def test_the_example_rig_has_an_absent_camera_and_six_different_views():
     assert len({tuple(mount.flatten().tolist()) for mount in rig.base_T_camera[0]}) == 6
     forward = rig.base_T_camera[0, 0, :3, 2]
     torch.testing.assert_close(forward, torch.tensor([1.0, 0.0, 0.0]), atol=1e-6, rtol=0)
+
+
+@pytest.mark.skipif(not is_installed("onnxruntime"), reason="onnxruntime is not installed")
+def test_export_writes_it_with_all_cameras_and_says_so(spec, tmp_path):
+    import onnxruntime
+
+    path = tmp_path / "toy.safetensors"
+    save_checkpoint(path, spec, build_depth_network(spec).state_dict())
+    assert main(["export", str(path)]) == 0
+    described = json.loads(path.with_suffix(".json").read_text())
+    assert described["network"] == KIND
+    assert described["input"].startswith("images [1, N, 3, H, W]")
+    session = onnxruntime.InferenceSession(path.with_suffix(".onnx"))
+    rig = RigImages.from_pictures(surround([True, False, True]))
+    inputs = {given.name: getattr(rig, given.name).numpy() for given in session.get_inputs()}
+    assert {"images", "present"} <= inputs.keys()
+    (disparity,) = session.run(["disparity"], inputs)
+    with torch.inference_mode():
+        np.testing.assert_allclose(disparity, build_depth_network(spec)(rig).numpy(), rtol=1e-4)
+
+
+def test_export_of_a_network_without_that_engine_is_refused(spec, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(MeanFeatureNet, "engines", ("torch_eager",))
+    path = tmp_path / "toy.safetensors"
+    save_checkpoint(path, spec, build_depth_network(spec).state_dict())
+    assert main(["export", str(path)]) == 1
+    assert f"backend onnxruntime cannot run the network {KIND}, resnet18" in capsys.readouterr().err
+    assert not path.with_suffix(".onnx").exists()
 
 
 def test_its_checkpoint_names_it_and_builds_it_again(spec, tmp_path):
