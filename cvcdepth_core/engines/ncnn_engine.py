@@ -52,8 +52,9 @@ class NcnnEngine:
 
     def _one(self, net: Any, image: np.ndarray) -> np.ndarray:
         extractor = net.create_extractor()
-        # A Mat made from an array neither owns nor keeps it; a clone has memory of its own.
-        extractor.input(INPUT, self._ncnn.Mat(np.ascontiguousarray(image)).clone())
+        # A Mat made from an array does not keep it alive, which it has to be until the clone has memory of its own.
+        contiguous = np.ascontiguousarray(image)
+        extractor.input(INPUT, self._ncnn.Mat(contiguous).clone())
         failed, disparity = extractor.extract(OUTPUT)
         if failed:
             raise EngineError(f"{self.name}: inference failed with code {failed} on an image of {image.shape}")

@@ -310,6 +310,19 @@ def test_ncnn_gives_the_same_depth_on_any_number_of_threads(monkeypatch: pytest.
 
 
 @needs_ncnn
+def test_ncnn_takes_images_whose_memory_is_not_contiguous(monkeypatch: pytest.MonkeyPatch):
+    """Side by side, one image's memory, were it freed too early, would be taken for another's."""
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 4)
+    engine = selection.checked_engine(lively_network("resnet18"), spec_of("resnet18"), CPU, "ncnn", "float32")
+    images = torch.rand(8, 3, 2 * HEIGHT, 2 * WIDTH, generator=torch.Generator().manual_seed(1))
+    rig = rig_of(images)
+    expected = engine.disparity(rig)
+    strided = images.contiguous(memory_format=torch.channels_last)[None]
+    for _ in range(5):
+        assert torch.equal(engine.disparity(rig._replace(images=strided)), expected)
+
+
+@needs_ncnn
 def test_a_layer_that_ncnn_was_not_taught_is_named():
     rewritten = RewrittenDepthNet(lively_network("resnet18"), transposed=False)
     rewritten.decoder.head.append(nn.GELU())
