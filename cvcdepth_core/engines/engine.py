@@ -1,15 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What every inference engine offers."""
 
-from typing import Literal, Protocol
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from cvcdepth_core.errors import EngineError
-
-Precision = Literal["float32", "bfloat16", "float16"]
-"""In what an engine computes; depth is float32 always."""
 
 
 class DeviceMemoryError(EngineError):

@@ -14,9 +14,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from cvcdepth_core.engines.engine import DeviceMemoryError, Precision, best_chunk
+from cvcdepth_core.engines.engine import DeviceMemoryError, best_chunk
 from cvcdepth_core.engines.rewriting import RewrittenDepthNet
 from cvcdepth_core.errors import EngineError
+from cvcdepth_core.model_choices import Precision
 from cvcdepth_core.networks import DepthNet
 from cvcdepth_core.networks.checkpoint import DepthModelSpec
 

@@ -2,7 +2,7 @@
 """The depth network and the pose network."""
 
 from cvcdepth_core.networks.depth import INPUT_STRIDE, DepthNet, disparity_to_depth
-from cvcdepth_core.networks.encoders import ENCODERS, Encoder, EncoderName
+from cvcdepth_core.networks.encoders import Encoder
 from cvcdepth_core.networks.pose import PoseNet
 
-__all__ = ["ENCODERS", "INPUT_STRIDE", "DepthNet", "Encoder", "EncoderName", "PoseNet", "disparity_to_depth"]
+__all__ = ["INPUT_STRIDE", "DepthNet", "Encoder", "PoseNet", "disparity_to_depth"]

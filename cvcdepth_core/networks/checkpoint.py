@@ -20,7 +20,8 @@ from torch import Tensor, nn
 
 from cvcdepth_core.errors import CheckpointError
 from cvcdepth_core.files import write_atomically
-from cvcdepth_core.networks import ENCODERS, INPUT_STRIDE, DepthNet, Encoder
+from cvcdepth_core.model_choices import ENCODERS
+from cvcdepth_core.networks import INPUT_STRIDE, DepthNet, Encoder
 from cvcdepth_core.networks.depth import MIN_INPUT_SIZE
 
 FORMAT_VERSION = "1"
