@@ -18,10 +18,10 @@ import numpy as np
 from measuring import json_lines, measure_in_turns, print_line
 from numpy.typing import NDArray
 
-from cvcdepth_core.estimator import SurroundDepth
 from cvcdepth_core.images.rectifier import SurroundPreprocessor
 from cvcdepth_core.pointcloud import CloudLimits, merged_cloud
 from cvcdepth_core.rig.rig import Rig
+from cvcdepth_core.surround_depth import SurroundDepth
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.bench.straightforward import straightforward_cloud
 from cvcdepth_ros.live.process_setup import prepare_process

@@ -2,7 +2,6 @@
 """Surround pictures in, metric depth out: the one estimator behind the node, the bag tool and the evaluation."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -17,20 +16,7 @@ from cvcdepth_core.model_choices import Precision
 from cvcdepth_core.networks import DepthNet, disparity_to_depth
 from cvcdepth_core.networks.checkpoint import DepthModelSpec, load_checkpoint
 from cvcdepth_core.rig.rig import Rig
-
-
-@dataclass(frozen=True, eq=False)
-class SurroundDepth:
-    """What was estimated for one surround set; every array holds the cameras in the rig's order."""
-
-    depth: NDArray[np.float32]
-    """[N, H, W] metres along each camera's optical axis, NaN where unknown (REP 118)."""
-    pictures: NDArray[np.uint8]
-    """[N, H, W, 3] RGB, rectified: pixel by pixel what `depth` describes."""
-    intrinsics: NDArray[np.float64]
-    """[N, 3, 3] of those pictures, pixel centres at the integers."""
-    present: NDArray[np.bool_]
-    """[N] which cameras gave a picture; the others' depth is NaN and their picture black."""
+from cvcdepth_core.surround_depth import SurroundDepth
 
 
 class PictureSize(Protocol):

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cvcdepth_core.estimator import SurroundDepth
 from cvcdepth_core.rig.rig import Rig
+from cvcdepth_core.surround_depth import SurroundDepth
 
 Cloud = NDArray[np.float32]
 

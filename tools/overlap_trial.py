@@ -22,10 +22,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cvcdepth_core.estimator import DepthEstimator, SurroundDepth
+from cvcdepth_core.estimator import DepthEstimator
 from cvcdepth_core.images.decoding import Picture
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.rig_health.overlap_monitor import OverlapMonitor
+from cvcdepth_core.surround_depth import SurroundDepth
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.recordings.replay import DepthReplay, SurroundReplay
 from cvcdepth_ros.recordings.rig import discover_rig

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from cvcdepth_core.estimator import SurroundDepth
 from cvcdepth_core.images.rectifier import to_tensor
 from cvcdepth_core.rendering.photometric import photometric_error
 from cvcdepth_core.rendering.projection import back_project, transform
@@ -26,6 +25,7 @@ from cvcdepth_core.rendering.view_synthesis import align_intensity, sample, samp
 from cvcdepth_core.rig.poses import Pose, inverse
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.scoring.scores import mean
+from cvcdepth_core.surround_depth import SurroundDepth
 from cvcdepth_core.training.losses import masked_mean
 
 Kind = Literal["spatial", "temporal"]

@@ -4,9 +4,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from cvcdepth_core.estimator import SurroundDepth
 from cvcdepth_core.pointcloud import CloudLimits
 from cvcdepth_core.rig.rig import Rig
+from cvcdepth_core.surround_depth import SurroundDepth
 
 
 def straightforward_cloud(surround: SurroundDepth, rig: Rig, limits: CloudLimits) -> NDArray[np.float32]:

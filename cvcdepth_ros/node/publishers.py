@@ -10,9 +10,9 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from cvcdepth_core.errors import ConfigError
-from cvcdepth_core.estimator import SurroundDepth
 from cvcdepth_core.pointcloud import CloudLimits
 from cvcdepth_core.rig.rig import Rig
+from cvcdepth_core.surround_depth import SurroundDepth
 from cvcdepth_ros.messages.conversion import ros_message_class, ros_message_factory
 from cvcdepth_ros.node.qos import refusing_impossible_qos
 from cvcdepth_ros.surround_sets.latencies import StageLatencies

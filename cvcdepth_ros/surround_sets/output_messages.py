@@ -5,9 +5,9 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from cvcdepth_core.estimator import SurroundDepth
 from cvcdepth_core.pointcloud import CloudLimits, merged_cloud, organised_cloud
 from cvcdepth_core.rig.rig import Rig
+from cvcdepth_core.surround_depth import SurroundDepth
 from cvcdepth_ros.messages.camera_discovery import CAMERA_INFO_TYPE, IMAGE_TYPE
 from cvcdepth_ros.messages.conversion import MessageFactory
 from cvcdepth_ros.surround_sets.synchronizer import SurroundSet

@@ -5,9 +5,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from cvcdepth_core.errors import ImageError
-from cvcdepth_core.estimator import SurroundDepth, SurroundDepthEstimator
+from cvcdepth_core.estimator import SurroundDepthEstimator
 from cvcdepth_core.images.decoding import Picture
 from cvcdepth_core.images.rectifier import Rectifier
+from cvcdepth_core.surround_depth import SurroundDepth
 from cvcdepth_ros.messages.conversion import picture_from_message
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
 

@@ -5,8 +5,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from recordings import SAMPLE
 
-from cvcdepth_core.estimator import SurroundDepth
 from cvcdepth_core.pointcloud import CloudLimits, merged_cloud, organised_cloud, pack_rgb, thinned
+from cvcdepth_core.surround_depth import SurroundDepth
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.bench.straightforward import straightforward_cloud
 from cvcdepth_ros.recordings.rig import discover_rig

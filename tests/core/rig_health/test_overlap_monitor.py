@@ -10,9 +10,9 @@ import pytest
 from numpy.typing import NDArray
 from street_scene import HEIGHT, WIDTH, K, camera, cast, turned
 
-from cvcdepth_core.estimator import SurroundDepth
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.rig_health.overlap_monitor import Finding, MonitorLimits, OverlapMonitor
+from cvcdepth_core.surround_depth import SurroundDepth
 
 CAMERAS = (camera("left", 0.5, 22.0), camera("middle", 0.0, 0.0), camera("right", -0.5, -22.0))
 RIG = Rig(CAMERAS, "base_link", "middle", {})

@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from street_scene import FOCAL, HEIGHT, WIDTH, K, camera, cast, turned
 
-from cvcdepth_core.estimator import SurroundDepth
 from cvcdepth_core.pointcloud import pixel_rays
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.scoring.consistency import (
@@ -25,6 +24,7 @@ from cvcdepth_core.scoring.consistency import (
     summarise_agreement,
     temporal_rows,
 )
+from cvcdepth_core.surround_depth import SurroundDepth
 
 RIG = Rig((camera("left", 0.4, 8.0), camera("right", -0.4, -8.0)), "base_link", "left", {})
 
