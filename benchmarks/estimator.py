@@ -180,7 +180,7 @@ def straightforward(
     """Return the pipeline that anyone would write first: one batch through the network."""
     import torch
 
-    from cvcdepth_core.images.rectifier import to_tensor
+    from cvcdepth_core.images.surround import to_tensor
     from cvcdepth_core.networks import disparity_to_depth
 
     network.eval().to(device)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cvcdepth_core.engines import build_engine
 from cvcdepth_core.images.decoding import Picture
-from cvcdepth_core.images.rectifier import SurroundPreprocessor
+from cvcdepth_core.images.surround import SurroundPreprocessor
 from cvcdepth_core.model_choices import Precision
 from cvcdepth_core.networks import DepthNet, disparity_to_depth
 from cvcdepth_core.networks.checkpoint import DepthModelSpec, load_checkpoint

@@ -104,14 +104,6 @@ class _View:
         cv2.merge([*xyz, pack_rgb(self._picture[rows])], dst=points)
 
 
-def pixel_rays(intrinsics: NDArray[np.float64], height: int, width: int) -> NDArray[np.float32]:
-    """Rays (x, y, 1) [H, W, 3] through the pixel centres, in the optical frame."""
-    u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
-    pixels = np.stack([u, v, np.ones_like(u)], axis=-1)
-    rays: NDArray[np.float64] = pixels @ np.linalg.inv(intrinsics).T
-    return rays.astype(np.float32)
-
-
 def pack_rgb(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Pack RGB [H, W, 3] into float32 [H, W] whose bits are 0x00RRGGBB, the `rgb` field that RViz and PCL read."""
     packed = np.zeros((*picture.shape[:2], 4), dtype=np.uint8)

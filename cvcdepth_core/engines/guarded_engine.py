@@ -11,7 +11,7 @@ from torch import Tensor
 from cvcdepth_core.engines.engine import DeviceMemoryError, DisparityEngine
 from cvcdepth_core.errors import EngineError
 from cvcdepth_core.images.decoding import Picture
-from cvcdepth_core.images.rectifier import to_tensor
+from cvcdepth_core.images.surround import to_tensor
 
 
 class GuardedEngine:

@@ -12,7 +12,7 @@ import torch
 from cvcdepth_core.engines.engine import DisparityEngine
 from cvcdepth_core.errors import EngineError
 from cvcdepth_core.images.decoding import Picture
-from cvcdepth_core.images.rectifier import to_tensor
+from cvcdepth_core.images.surround import to_tensor
 from cvcdepth_core.model_choices import Precision
 from cvcdepth_core.networks import DepthNet, disparity_to_depth
 from cvcdepth_core.networks.checkpoint import DepthModelSpec

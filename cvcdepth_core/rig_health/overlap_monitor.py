@@ -29,7 +29,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from cvcdepth_core.rig.calibration import scale_intrinsics
+from cvcdepth_core.rig.pinhole import rays_through, scale_intrinsics
 from cvcdepth_core.rig.poses import inverse
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.scoring.consistency import PosedDepth, disagreement
@@ -376,7 +376,7 @@ def _overlapping_points(
     contrasts = np.flatnonzero(np.abs(view.structure) > _CONTRAST)
     v, u = np.divmod(contrasts[:: max(1, len(contrasts) // _CANDIDATES)], view.structure.shape[1])
     z = view.depth[v, u]
-    rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(view.intrinsics).T
+    rays = rays_through(np.stack([u, v], axis=1), view.intrinsics)
     points = (rays * z[:, None]) @ other_T_view[:3, :3].T + other_T_view[:3, 3]
     with np.errstate(invalid="ignore", divide="ignore"):
         pixels = (points @ other.intrinsics.T)[:, :2] / points[:, 2:]

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from cvcdepth_core.errors import RigError
 from cvcdepth_core.images.decoding import Picture
-from cvcdepth_core.images.rectifier import SurroundPreprocessor, raw_pixels
-from cvcdepth_core.pointcloud import pixel_rays
+from cvcdepth_core.images.rectifier import raw_pixels
+from cvcdepth_core.images.surround import SurroundPreprocessor
+from cvcdepth_core.rig.pinhole import pixel_rays
 from cvcdepth_core.rig.rig import Camera, Rig
 
 MIN_TRAVEL = 0.5

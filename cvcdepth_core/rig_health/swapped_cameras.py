@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from cvcdepth_core.rendering.photometric import photometric_error
-from cvcdepth_core.rendering.projection import pixel_rays, rigid_inverse, transform
+from cvcdepth_core.rendering.projection import rigid_inverse, transform, unit_depth_points
 from cvcdepth_core.rendering.view_synthesis import align_intensity, sample, sampling_grid
 
 _DEPTHS = (1.5, 2.5, 4.0, 7.0, 14.0, 40.0, 1000.0)  # metres
@@ -110,7 +110,7 @@ class _Sweep:
         """Return the error of each set where `camera` in one place sees what `other` sees in its; None: nothing."""
         other_T_view = rigid_inverse(self._poses[other_place]) @ self._poses[place]
         height, width = self._pictures.shape[-2:]
-        rays = pixel_rays(torch.linalg.inv(self._intrinsics[camera]), height, width)
+        rays = unit_depth_points(torch.linalg.inv(self._intrinsics[camera]), height, width)
         points = rays * torch.tensor(_DEPTHS)[:, None, None]
         grid, z = sampling_grid(transform(other_T_view, points), self._intrinsics[other], (height, width))
         ahead = (grid.abs() <= 1).all(dim=-1) & (z.view(grid.shape[:-1]) > 0)  # [D, H, W]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from cvcdepth_core.images.rectifier import to_tensor
+from cvcdepth_core.images.surround import to_tensor
 from cvcdepth_core.rendering.photometric import photometric_error
 from cvcdepth_core.rendering.projection import back_project, transform
 from cvcdepth_core.rendering.view_synthesis import align_intensity, sample, sampling_grid, warp_views

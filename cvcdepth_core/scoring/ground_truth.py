@@ -15,41 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvcdepth_core.errors import ConfigError, ImageError
-from cvcdepth_core.rig.poses import Pose, inverse
-from cvcdepth_core.rig.rig import Camera
+from cvcdepth_core.rig.pinhole import PinholeView, rays_through
 
 _NEAREST_OVERLAP = 1.0
 _LARGEST_REACH = 64
 """Cells around a point that are searched for what hides it: work grows with the square. Wide lenses stay below it."""
-
-
-@dataclass(frozen=True, eq=False)
-class PinholeView:
-    """A rectified picture and where it was taken from."""
-
-    intrinsics: NDArray[np.float64]
-    """[3, 3], pixel centres at the integers."""
-    base_T_camera: Pose
-    """[4, 4] metres."""
-    height: int
-    width: int
-
-    @classmethod
-    def of(cls, camera: Camera) -> PinholeView:
-        """Return the camera's rectified picture at its full size, which is where truth is compared."""
-        width, height = camera.calibration.image_size
-        return cls(camera.calibration.rectified_intrinsics, camera.base_T_camera, height, width)
-
-    def project(self, points: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return pixels (u, v) [M, 2] and depths z [M] in metres of `points` [M, 3] in the base frame.
-
-        Pixels of points that are not in front of the camera are NaN.
-        """
-        camera_T_base = inverse(self.base_T_camera)
-        in_camera = points.astype(np.float64) @ camera_T_base[:3, :3].T + camera_T_base[:3, 3]
-        z = in_camera[:, 2]
-        divisor = np.where(z > 0, z, np.nan)[:, None]
-        return (in_camera @ self.intrinsics.T)[:, :2] / divisor, z
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,8 +111,8 @@ def sparse_depth(
 
 def overlap_pixels(truth: SparseDepth, view: PinholeView, neighbours: Sequence[PinholeView]) -> NDArray[np.bool_]:
     """Return which pixels [M] of `truth` a neighbour sees too: inside its picture, z > 1 m (method section 9)."""
-    pixels = np.stack([truth.columns, truth.rows, np.ones(len(truth))], axis=1)
-    in_camera = pixels @ np.linalg.inv(view.intrinsics).T * truth.depth[:, None]
+    pixels = np.stack([truth.columns, truth.rows], axis=1)
+    in_camera = rays_through(pixels, view.intrinsics) * truth.depth[:, None]
     points = in_camera @ view.base_T_camera[:3, :3].T + view.base_T_camera[:3, 3]
     seen = np.zeros(len(truth), dtype=bool)
     for neighbour in neighbours:

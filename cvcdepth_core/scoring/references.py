@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from cvcdepth_core.errors import ConfigError
 from cvcdepth_core.images.decoding import Picture
-from cvcdepth_core.images.rectifier import SurroundPreprocessor
-from cvcdepth_core.pointcloud import pixel_rays
+from cvcdepth_core.images.surround import SurroundPreprocessor
+from cvcdepth_core.rig.pinhole import pixel_rays
 from cvcdepth_core.rig.rig import Rig
 
 REFERENCE_HEIGHT, REFERENCE_WIDTH = 384, 640

@@ -16,7 +16,8 @@ from cvcdepth_ros.version import package_version
 
 if TYPE_CHECKING:
     from cvcdepth_core.estimator import DepthPredictor
-    from cvcdepth_core.rig.rig import Rig, RigLayout
+    from cvcdepth_core.rig.rig import Rig
+    from cvcdepth_core.rig.rig_file import RigLayout
     from cvcdepth_core.scoring.ground_truth import OcclusionFilter
     from cvcdepth_core.scoring.scores import ScoreSettings
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from cvcdepth_core.errors import RecordingError
 from cvcdepth_core.rig.poses import Pose
 from cvcdepth_core.scoring.consistency import AgreementTable, PosedDepth, spatial_rows, temporal_rows
-from cvcdepth_core.scoring.ground_truth import PinholeView, SparseDepth, overlap_pixels, sample_prediction
+from cvcdepth_core.scoring.ground_truth import SparseDepth, overlap_pixels, sample_prediction
 from cvcdepth_core.scoring.scores import DepthSamples, Scores, SurroundScorer
 from cvcdepth_core.visualization import Points
 from cvcdepth_ros.bags import open_recording
@@ -65,7 +65,7 @@ class MeasuredSet:
     def samples(self) -> list[DepthSamples]:
         """Return what is scored of each camera."""
         rig, depth = self.estimated.rig, self.estimated.depth.depth
-        views = {camera.name: PinholeView.of(camera) for camera in rig.cameras}
+        views = {camera.name: camera.rectified_view for camera in rig.cameras}
         found = []
         for name, truth, prediction in zip(rig.names, self.truth, depth, strict=True):
             others = [views[other] for other in rig.neighbours[name]]

@@ -23,7 +23,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from cvcdepth_core.errors import ImageError, RecordingError
 from cvcdepth_core.images.decoding import Picture
-from cvcdepth_core.images.rectifier import SurroundPreprocessor
+from cvcdepth_core.images.surround import SurroundPreprocessor
 from cvcdepth_core.networks.pose import MAX_TRANSLATION
 from cvcdepth_core.rig.poses import inverse
 from cvcdepth_core.training.batch import RigBatch

@@ -12,7 +12,7 @@ from recordings import SAMPLE
 
 from cvcdepth_core.errors import OutputError
 from cvcdepth_core.files import write_atomically
-from cvcdepth_core.rig.rig import RigLayout, save_rig_layout
+from cvcdepth_core.rig.rig_file import RigLayout, save_rig_layout
 from cvcdepth_ros.bag_replay import main
 from cvcdepth_ros.evaluation.image_scores import write_csv
 from cvcdepth_ros.settings import MatchingSettings

@@ -5,8 +5,8 @@ import math
 
 import numpy as np
 
-from cvcdepth_core.pointcloud import pixel_rays
 from cvcdepth_core.rig.calibration import Calibration
+from cvcdepth_core.rig.pinhole import pixel_rays
 from cvcdepth_core.rig.rig import Camera
 
 HEIGHT, WIDTH, FOCAL = 96, 160, 110.0

@@ -21,7 +21,7 @@ from cvcdepth_core.engines.rewriting import RewrittenDepthNet
 from cvcdepth_core.engines.torch_engine import MixedPrecision, PaddedBatches, TorchEagerEngine, TorchEngine
 from cvcdepth_core.errors import ConfigError, EngineError
 from cvcdepth_core.estimator import DepthEstimator
-from cvcdepth_core.images.rectifier import to_tensor
+from cvcdepth_core.images.surround import to_tensor
 from cvcdepth_core.model_choices import ENCODERS, Precision
 from cvcdepth_core.networks import DepthNet, disparity_to_depth
 from cvcdepth_core.networks.checkpoint import DepthModelSpec, save_checkpoint

@@ -9,7 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from cvcdepth_core.errors import RigError
-from cvcdepth_core.rig.calibration import Calibration, calibration_from_fields, scale_intrinsics
+from cvcdepth_core.rig.calibration import Calibration, calibration_from_fields
+from cvcdepth_core.rig.pinhole import scale_intrinsics
 
 K = (500.0, 0.0, 320.5, 0.0, 510.0, 239.5, 0.0, 0.0, 1.0)
 P = (450.0, 0.0, 330.0, 0.0, 0.0, 460.0, 250.0, 0.0, 0.0, 0.0, 1.0, 0.0)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from street_scene import FOCAL, HEIGHT, WIDTH, K, camera, cast, turned
 
-from cvcdepth_core.pointcloud import pixel_rays
+from cvcdepth_core.rig.pinhole import pixel_rays
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.scoring.consistency import (
     Agreement,

@@ -8,9 +8,9 @@ import torch
 from torch.nn.functional import interpolate
 
 from cvcdepth_core.errors import ConfigError
+from cvcdepth_core.rig.pinhole import PinholeView
 from cvcdepth_core.scoring.ground_truth import (
     OcclusionFilter,
-    PinholeView,
     SparseDepth,
     overlap_pixels,
     sample_prediction,
