@@ -13,11 +13,10 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from cvcdepth_core.errors import RigError, TransformError
-from cvcdepth_core.files import write_atomically
+from cvcdepth_core.files import load_yaml, write_atomically
 from cvcdepth_core.rig.calibration import Calibration, first_validation_message
 from cvcdepth_core.rig.poses import Pose, pose_from_quaternion, quaternion_from_rotation
 from cvcdepth_core.rig.rig import Camera, Rig
-from cvcdepth_core.yaml_text import load_yaml
 
 # What a ROS topic takes between two slashes, since output topics carry the camera's name.
 _TOPIC_PART = r"^[A-Za-z][A-Za-z0-9_]*$"

@@ -11,12 +11,12 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from cvcdepth_core.errors import ConfigError
+from cvcdepth_core.files import load_yaml
 from cvcdepth_core.model_choices import EncoderName
 from cvcdepth_core.networks.checkpoint import DepthModelSpec
 from cvcdepth_core.training.augmentation import ColorJitterConfig, FlipMode
 from cvcdepth_core.training.model import PoseMethod
 from cvcdepth_core.training.objective import ObjectiveConfig
-from cvcdepth_core.yaml_text import load_yaml
 
 ExposureMotion = Literal["auto", "recorded", "network", "none"]
 

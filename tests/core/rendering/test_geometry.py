@@ -81,7 +81,6 @@ def test_poses_at_exposure_are_those_of_a_vehicle_with_constant_velocity_and_tur
 
 
 @settings(max_examples=30, deadline=None)
-@settings(deadline=None)
 @given(seed=SEEDS, height=st.integers(1, 9), width=st.integers(1, 9), focal=st.floats(5, 2000))
 def test_back_projected_pixels_project_to_where_they_came_from(seed, height, width, focal):
     depth = 0.5 + 80 * torch.rand(2, 3, 1, height, width, dtype=FLOAT64, generator=torch.Generator().manual_seed(seed))
