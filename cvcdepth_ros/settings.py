@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
-from cvcdepth_core.errors import ConfigError
+from cvcdepth_core.errors import ConfigError, first_validation_message
 from cvcdepth_core.model_choices import DEFAULT, NOTICE, Backend, Precision, checkpoint_path
-from cvcdepth_core.rig.calibration import first_validation_message
 
 if TYPE_CHECKING:
     from cvcdepth_core.estimator import DepthEstimator

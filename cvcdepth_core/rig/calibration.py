@@ -2,7 +2,6 @@
 """One camera's calibration: the content of a `sensor_msgs/CameraInfo`, validated."""
 
 import math
-import reprlib
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, model_validator
 
-from cvcdepth_core.errors import RigError
+from cvcdepth_core.errors import RigError, first_validation_message
 from cvcdepth_core.rig.pinhole import scale_intrinsics
 
 DistortionModel = Literal["plumb_bob", "rational_polynomial", "equidistant"]
@@ -132,22 +131,6 @@ def calibration_from_fields(camera: str, fields: dict[str, object]) -> Calibrati
         return Calibration.model_validate(fields)
     except ValueError as error:
         raise RigError(f"camera {camera}: camera_info: {first_validation_message(error)}") from error
-
-
-def first_validation_message(error: ValueError) -> str:
-    """One line out of a pydantic ValidationError: the field, what is wrong with it and the value found."""
-    details = getattr(error, "errors", None)
-    if details is None:
-        return str(error)
-    first = details()[0]
-    where = ".".join(str(part) for part in first["loc"])
-    message = str(first["msg"]).removeprefix("Value error, ")
-    if not where:
-        return message
-    # Our own checks say the value themselves, and a missing field has none.
-    says_all = first["type"] in ("missing", "value_error")
-    # The whole of a foreign value may have no end: a few lines of YAML can refer to themselves a billion times.
-    return f"{where}: {message}" if says_all else f"{where}: {message}, found {reprlib.repr(first['input']):.80}"
 
 
 def _first_problem(calibration: Calibration) -> str | None:

@@ -12,9 +12,9 @@ from pathlib import Path
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from cvcdepth_core.errors import RigError, TransformError
+from cvcdepth_core.errors import RigError, TransformError, first_validation_message
 from cvcdepth_core.files import load_yaml, write_atomically
-from cvcdepth_core.rig.calibration import Calibration, first_validation_message
+from cvcdepth_core.rig.calibration import Calibration
 from cvcdepth_core.rig.poses import Pose, pose_from_quaternion, quaternion_from_rotation
 from cvcdepth_core.rig.rig import Camera, Rig
 

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from cvcdepth_core.errors import ConfigError
+from cvcdepth_core.errors import ConfigError, validation_messages
 from cvcdepth_core.files import load_yaml
 from cvcdepth_core.model_choices import EncoderName
 from cvcdepth_core.networks.checkpoint import DepthModelSpec
@@ -171,9 +171,7 @@ def load_training_config(path: str | Path) -> TrainingConfig:
     try:
         return TrainingConfig.model_validate(_read_with_bases(path, above=()))
     except ValidationError as error:
-        raise ConfigError(
-            f"{path}: {'; '.join(_describe(item) for item in error.errors(include_url=False))}"
-        ) from error
+        raise ConfigError(f"{path}: {validation_messages(error, TrainingConfig)}") from error
 
 
 def _read_with_bases(path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
@@ -204,21 +202,3 @@ def _overlay(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, A
         below = merged.get(key)
         merged[key] = _overlay(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
     return merged
-
-
-def _describe(item: Mapping[str, Any]) -> str:
-    name = ".".join(map(str, item["loc"]))
-    if item["type"] == "extra_forbidden":
-        return f"{name} is no known field; {_known_fields(item['loc'])}"
-    if item["type"] == "missing":
-        return f"{name} is missing"
-    if not name:
-        return str(item["msg"])
-    return f"{name} is {item['input']!r}: {item['msg']}"
-
-
-def _known_fields(location: tuple[str | int, ...]) -> str:
-    section: Any = TrainingConfig
-    for part in location[:-1]:
-        section = section.model_fields[part].annotation
-    return f"expected one of {', '.join(section.model_fields)}"

@@ -15,7 +15,7 @@ import torch
 import yaml
 from pydantic import ValidationError
 
-from cvcdepth_core.errors import CheckpointError, OutputError
+from cvcdepth_core.errors import CheckpointError, OutputError, validation_messages
 from cvcdepth_core.files import write_atomically
 from cvcdepth_core.training.config import TrainingConfig
 
@@ -147,7 +147,7 @@ def _configuration(path: Path, state: Mapping[str, Any]) -> TrainingConfig:
     try:
         return TrainingConfig.model_validate_json(state["config"])
     except ValidationError as error:
-        reason = " ".join(str(error).split())
+        reason = validation_messages(error, TrainingConfig)
         raise CheckpointError(f"{path}: its configuration is not one of this version: {reason}") from error
 
 
