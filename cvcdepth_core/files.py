@@ -7,6 +7,7 @@ Of YAML only plain values are taken, of a size that their text accounts for.
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -45,6 +46,11 @@ def write_atomically(path: Path, content: bytes) -> None:
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write a result as `write_atomically` does."""
     write_atomically(path, f"{json.dumps(content, indent=2)}\n".encode())
+
+
+def nan_to_null(numbers: Mapping[str, float]) -> dict[str, float | None]:
+    """Return the numbers for JSON, which has no NaN: None, its null, in the place of each."""
+    return {name: None if math.isnan(number) else number for name, number in numbers.items()}
 
 
 def load_yaml(text: str) -> Any:

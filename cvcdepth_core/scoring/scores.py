@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from cvcdepth_core.errors import ConfigError
+from cvcdepth_core.files import nan_to_null
 from cvcdepth_core.scoring.metrics import METRIC_NAMES, SUMS, ErrorSums, Sums, median_ratio, metrics_of, sum_errors
 
 Protocol = Literal["image", "pool"]
@@ -150,11 +151,8 @@ class Score(NamedTuple):
 
     def to_json(self) -> dict[str, Any]:
         """Return it with JSON's types; what is NaN is null."""
-        numbers = self.metrics | {"coverage": self.coverage}
-        return {name: None if math.isnan(number) else number for name, number in numbers.items()} | {
-            "truth_points": self.truth,
-            "measurements": self.measurements,
-        }
+        counts = {"truth_points": self.truth, "measurements": self.measurements}
+        return nan_to_null(self.metrics | {"coverage": self.coverage}) | counts
 
 
 class Summary(NamedTuple):
