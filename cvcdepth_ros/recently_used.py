@@ -28,7 +28,7 @@ class RecentlyUsed(Generic[Key, Value]):
         return self._values[key][1]
 
     def put(self, key: Key, value: Value, size: int) -> None:
-        """Keep a value of `size` bytes, in the place of an older one; what does not fit is dropped, a too large one too."""
+        """Keep a value of `size` bytes, in the place of an older one; what does not fit is dropped, even this one."""
         self._size += size
         if key in self._values:
             self._size -= self._values.pop(key)[0]

@@ -29,10 +29,10 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from cvcdepth_core.rendering.agreement import PosedDepth, disagreement
 from cvcdepth_core.rig.pinhole import rays_through, scale_intrinsics
 from cvcdepth_core.rig.poses import inverse
 from cvcdepth_core.rig.rig import Rig
-from cvcdepth_core.scoring.consistency import PosedDepth, disagreement
 from cvcdepth_core.surround_depth import SurroundDepth
 
 Quantity = Literal["misalignment", "disagreement", "sharpness"]

@@ -14,11 +14,11 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
-from cvcdepth_core.rendering.photometric import photometric_error
+from cvcdepth_core.rendering.photometric import masked_mean, photometric_error
 from cvcdepth_core.rendering.projection import back_project, rigid_inverse, transform
 from cvcdepth_core.rendering.view_synthesis import Warp, align_intensity, sample, splat_depth, sum_by_target, warp_views
 from cvcdepth_core.training.batch import RigBatch
-from cvcdepth_core.training.losses import auto_mask, masked_mean, pose_consistency, smoothness
+from cvcdepth_core.training.losses import auto_mask, pose_consistency, smoothness
 from cvcdepth_core.training.motion import motions_seen_from_anchor, relative_poses
 
 _IDENTITY_NOISE = 1e-5

@@ -16,8 +16,9 @@ import torch
 from numpy.typing import NDArray
 
 from cvcdepth_core.errors import RecordingError
+from cvcdepth_core.rendering.agreement import PosedDepth
 from cvcdepth_core.rig.poses import Pose
-from cvcdepth_core.scoring.consistency import AgreementTable, PosedDepth, spatial_rows, temporal_rows
+from cvcdepth_core.scoring.consistency import AgreementTable, spatial_rows, temporal_rows
 from cvcdepth_core.scoring.ground_truth import SparseDepth, overlap_pixels, sample_prediction
 from cvcdepth_core.scoring.scores import DepthSamples, Scores, SurroundScorer
 from cvcdepth_core.visualization import Points
@@ -60,7 +61,7 @@ class MeasuredSet:
     @property
     def posed(self) -> PosedDepth:
         """The depth with the cameras' places."""
-        return PosedDepth.of(self.estimated.depth, self.estimated.rig, self.world_T_base)
+        return PosedDepth.from_rig(self.estimated.depth, self.estimated.rig, self.world_T_base)
 
     def samples(self) -> list[DepthSamples]:
         """Return what is scored of each camera."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from cvcdepth_core.networks import DepthNet, PoseNet, disparity_to_depth
-from cvcdepth_core.rendering.photometric import photometric_error, ssim_distance
+from cvcdepth_core.rendering.photometric import masked_mean, photometric_error, ssim_distance
 from cvcdepth_core.rendering.projection import back_project, rigid_inverse, transform
 from cvcdepth_core.rendering.view_synthesis import align_intensity, overlap_statistics, sample, warp_views
 from cvcdepth_core.scoring.ground_truth import SparseDepth, downsample_ground_truth, sample_prediction
@@ -26,7 +26,7 @@ from cvcdepth_core.scoring.scores import ALL, DepthSamples, Score, ScoreSettings
 from cvcdepth_core.training import objective
 from cvcdepth_core.training.augmentation import apply_changes, mirror, mirror_motion
 from cvcdepth_core.training.batch import RigBatch
-from cvcdepth_core.training.losses import auto_mask, masked_mean, smoothness
+from cvcdepth_core.training.losses import auto_mask, smoothness
 from cvcdepth_core.training.motion import distribute_anchor_motion, motion_to_context, relative_poses
 from cvcdepth_core.training.objective import (
     ObjectiveConfig,
