@@ -19,8 +19,10 @@ from cvcdepth_core.errors import RecordingError
 from cvcdepth_core.rendering.agreement import PosedDepth
 from cvcdepth_core.rig.poses import Pose
 from cvcdepth_core.scoring.consistency import AgreementTable, spatial_rows, temporal_rows
-from cvcdepth_core.scoring.ground_truth import SparseDepth, overlap_pixels, sample_prediction
-from cvcdepth_core.scoring.scores import DepthSamples, Scores, SurroundScorer
+from cvcdepth_core.scoring.ground_truth import overlap_pixels, sample_prediction
+from cvcdepth_core.scoring.scorer import DepthSamples, SurroundScorer
+from cvcdepth_core.scoring.scores import Scores
+from cvcdepth_core.scoring.sparse_depth import SparseDepth
 from cvcdepth_core.visualization import Points
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.evaluation.job import EvaluationJob

@@ -15,8 +15,7 @@ from cvcdepth_core.errors import ConfigError, RecordingError
 from cvcdepth_core.files import nan_to_null
 from cvcdepth_core.scoring.comparison import Comparison, compare
 from cvcdepth_core.scoring.consistency import AgreementTable, summarise_agreement
-from cvcdepth_core.scoring.scores import SCALINGS, Scaling, Scores, Summary
-from cvcdepth_core.scoring.scores import Protocol as ScoreProtocol
+from cvcdepth_core.scoring.scores import SCALINGS, EvaluationProtocol, Scaling, Scores, Summary
 from cvcdepth_ros.evaluation.image_scores import ImageScore, SetScore, correlations, image_scores
 from cvcdepth_ros.evaluation.job import Dependencies, EvaluationJob
 from cvcdepth_ros.evaluation.measuring import RecordingScores
@@ -24,7 +23,7 @@ from cvcdepth_ros.evaluation.measuring import RecordingScores
 SCHEMA = 2
 _DECIDE_WHAT_IS_MEASURED = ("rig", "base_frame", "tolerance", "lidar", "lidar_tolerance", "no_occlusion_filter")
 
-PROTOCOLS: tuple[ScoreProtocol, ...] = ("image", "pool")
+PROTOCOLS: tuple[EvaluationProtocol, ...] = ("image", "pool")
 
 
 class Failure(NamedTuple):
@@ -96,7 +95,7 @@ class EvaluationResult:
         numbers = chain.from_iterable(range(len(table)) for table in self.scores.images)
         return list(map(SetScore.of, numbers, image_scores(self.scores, self.agreement)))
 
-    def summary(self, protocol: ScoreProtocol = "image", scaling: Scaling = "metric") -> Summary:
+    def summary(self, protocol: EvaluationProtocol = "image", scaling: Scaling = "metric") -> Summary:
         """Take the means over all recordings."""
         return self.scores.summary(protocol, scaling)
 

@@ -9,13 +9,8 @@ from torch.nn.functional import interpolate
 
 from cvcdepth_core.errors import ConfigError
 from cvcdepth_core.rig.pinhole import PinholeView
-from cvcdepth_core.scoring.ground_truth import (
-    OcclusionFilter,
-    SparseDepth,
-    overlap_pixels,
-    sample_prediction,
-    sparse_depth,
-)
+from cvcdepth_core.scoring.ground_truth import overlap_pixels, sample_prediction, sparse_depth
+from cvcdepth_core.scoring.sparse_depth import OcclusionFilter, SparseDepth
 
 K = np.array([[100.0, 0.0, 49.5], [0.0, 100.0, 39.5], [0.0, 0.0, 1.0]])
 # Optical frame (z forward, x right, y down) in the base frame (x forward, y left, z up).

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from cvcdepth_core.errors import ConfigError
 from cvcdepth_core.scoring.metrics import METRIC_NAMES, sum_errors
-from cvcdepth_core.scoring.scores import ALL, OVERLAP, DepthSamples, Scores, ScoreSettings, SurroundScorer
+from cvcdepth_core.scoring.scorer import DepthSamples, SurroundScorer
+from cvcdepth_core.scoring.scores import ALL, OVERLAP, Scores, ScoreSettings
 
 CAMERAS = ("front", "left", "back")
 

@@ -8,8 +8,10 @@ import pytest
 from recordings import SAMPLE
 
 from cvcdepth_core.errors import ConfigError, RecordingError, TransformError
-from cvcdepth_core.scoring.ground_truth import OcclusionFilter, sample_prediction, sparse_depth
-from cvcdepth_core.scoring.scores import ALL, DepthSamples, ScoreSettings, SurroundScorer
+from cvcdepth_core.scoring.ground_truth import sample_prediction, sparse_depth
+from cvcdepth_core.scoring.scorer import DepthSamples, SurroundScorer
+from cvcdepth_core.scoring.scores import ALL, ScoreSettings
+from cvcdepth_core.scoring.sparse_depth import OcclusionFilter
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.messages.transforms import PoseTrack, TransformTree
 from cvcdepth_ros.recordings.lidar import LidarSweeps, VehicleMotion, cloud_topics, points_from_message
