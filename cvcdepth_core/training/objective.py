@@ -217,11 +217,11 @@ def masked_errors(
     """
     target, overlap = batch.images[:, None], views.overlap
     reprojection = photometric_error(views.temporal, target).amin(dim=1)
-    moved = auto_mask(reprojection, _identity_error(batch, identity_noise)) * batch.masks
+    auto_masks = auto_mask(reprojection, _identity_error(batch, identity_noise)) * batch.masks
     spatial_mask = batch.masks * overlap.masks[:, 0]
-    st_masks = batch.masks[:, None] * overlap.masks[:, 1:] * moved[:, None]
+    st_masks = batch.masks[:, None] * overlap.masks[:, 1:] * auto_masks[:, None]
     spatial, spatio_temporal = overlap.images[:, :1], overlap.images[:, 1:]
-    errors = {"temporal": (reprojection, moved)}
+    errors = {"temporal": (reprojection, auto_masks)}
     if config.spatial > 0:
         errors["spatial"] = (photometric_error(spatial, target).squeeze(1), spatial_mask)
     if config.spatio_temporal > 0:

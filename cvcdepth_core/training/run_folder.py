@@ -138,8 +138,8 @@ class RunIdentity:
             if were.get(name) != self.inputs.get(name)
         ]
         if differences:
-            told = "; ".join(differences)
-            raise CheckpointError(f"{path}: was made from something else: {told}; choose another folder")
+            listed = "; ".join(differences)
+            raise CheckpointError(f"{path}: was made from something else: {listed}; choose another folder")
 
 
 def _configuration(path: Path, state: Mapping[str, Any]) -> TrainingConfig:

@@ -30,7 +30,7 @@ from cvcdepth_core.networks.checkpoint import save_checkpoint
 from cvcdepth_core.training.augmentation import draw_flips, jitter_colors
 from cvcdepth_core.training.batch import RigBatch
 from cvcdepth_core.training.config import AugmentationConfig, TrainingConfig
-from cvcdepth_core.training.distributed import ALONE, Processes, share_batch_statistics
+from cvcdepth_core.training.distributed import SINGLE_PROCESS, Processes, share_batch_statistics
 from cvcdepth_core.training.model import SurroundModel
 from cvcdepth_core.training.objective import ObjectiveValue, Prediction, evaluate_objective
 from cvcdepth_core.training.run_folder import RunFolder, RunIdentity
@@ -111,7 +111,7 @@ class Trainer:
         validate: Validation | None = None,
         metadata: Mapping[str, str] | None = None,
         observers: Sequence[RunObserver] = (),
-        processes: Processes = ALONE,
+        processes: Processes = SINGLE_PROCESS,
         inputs: Mapping[str, str] | None = None,
     ) -> None:
         """`metadata` travels in the checkpoints. Of several `processes`, the first alone validates, writes and tells.
@@ -133,7 +133,9 @@ class Trainer:
         self._validate = validate
         self._observers = tuple(observers) if processes.is_first else ()
         self._metadata = dict(metadata or {})
-        self._inputs: dict[str, str] = json.loads(processes.told_by_first(json.dumps(dict(inputs or {})).encode()))
+        self._inputs: dict[str, str] = json.loads(
+            processes.broadcast_from_first(json.dumps(dict(inputs or {})).encode())
+        )
         self._folder = RunFolder(run_directory)
         self._optimizer = torch.optim.AdamW(
             self.model.parameters(),
@@ -216,7 +218,7 @@ class Trainer:
         return self.progress.epoch * samples + min(self.progress.batch * self._samples_together, samples)
 
     def _resume(self) -> None:
-        content = self._processes.told_by_first(self._folder.read_state() if self._processes.is_first else b"")
+        content = self._processes.broadcast_from_first(self._folder.read_state() if self._processes.is_first else b"")
         if content:
             state = self._folder.state_from(content)
             self._identity.refuse_other(state, self._folder.state)
@@ -281,7 +283,7 @@ class Trainer:
         The processes have to go through the networks as often, or they would wait for each other's statistics for ever.
         """
         missing = torch.tensor([float(batch is None) for batch in batches], device=self._device)
-        somewhere = self._processes.add_up(missing).tolist()
+        somewhere = self._processes.sum_over_processes(missing).tolist()
         return {place: batch for place, batch in enumerate(batches) if batch is not None and not somewhere[place]}
 
     def _backpropagate(self, batch: RigBatch, place: int) -> ObjectiveValue:
@@ -309,13 +311,13 @@ class Trainer:
         columns |= {name: [value.terms[name].flatten() for value in values] for name in values[0].terms}
         joined = [torch.cat(column).double() for column in columns.values()]
         sums = torch.stack([torch.stack([column.sum(), torch.ones_like(column).sum()]) for column in joined])
-        totals, counts = self._processes.add_up(sums).unbind(1)
+        totals, counts = self._processes.sum_over_processes(sums).unbind(1)
         means = dict(zip(columns, (totals / counts).tolist(), strict=True))
         return int(counts[0]), means.pop(""), means
 
     def _mean_gradient_norm(self, samples: int) -> float:
         """Turn the gradients' sum into the mean of all processes and shorten it if configured; return its length."""
-        self._processes.add_up_gradients(list(self.model.parameters()))
+        self._processes.sum_gradients_over_processes(list(self.model.parameters()))
         for parameter in self.model.parameters():
             if parameter.grad is not None:
                 parameter.grad /= max(samples, 1)
@@ -341,7 +343,7 @@ class Trainer:
         if self._validate is None:
             return
         scores = self._scores(self._validate) if self._processes.is_first else b""
-        entry = json.loads(self._processes.told_by_first(scores))
+        entry = json.loads(self._processes.broadcast_from_first(scores))
         self.progress.stopped = entry["stop"]
         self.validations.append(entry)
         self._log(entry)
@@ -379,7 +381,7 @@ def _refuse_uneven_shares(config: TrainingConfig, processes: Processes) -> None:
 
 
 def _refuse_different_samples(samples: int, processes: Processes) -> None:
-    first = int(processes.told_by_first(str(samples).encode()))
+    first = int(processes.broadcast_from_first(str(samples).encode()))
     if samples != first:
         raise TrainingError(
             f"process {processes.rank} has {samples} samples, the first has {first}: the machines do not have the same "

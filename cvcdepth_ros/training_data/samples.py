@@ -27,7 +27,7 @@ from cvcdepth_core.networks.pose import MAX_TRANSLATION
 from cvcdepth_core.rig.poses import inverse
 from cvcdepth_core.training.batch import RigBatch
 from cvcdepth_core.training.config import RecordingsConfig, TrainingConfig
-from cvcdepth_core.training.distributed import ALONE, Processes
+from cvcdepth_core.training.distributed import SINGLE_PROCESS, Processes
 from cvcdepth_ros.bags import Recording, open_recording
 from cvcdepth_ros.messages.conversion import picture_from_message, stamp_ns
 from cvcdepth_ros.recently_used import RecentlyUsed
@@ -317,7 +317,9 @@ class RecordingBatches:
     networks of several processes together are of one rig, too.
     """
 
-    def __init__(self, indexes: Sequence[RecordingIndex], config: TrainingConfig, processes: Processes = ALONE) -> None:
+    def __init__(
+        self, indexes: Sequence[RecordingIndex], config: TrainingConfig, processes: Processes = SINGLE_PROCESS
+    ) -> None:
         """Find the samples; RecordingError names recording and values when there are none."""
         _refuse_unrecorded_motion(indexes, config.recordings)
         refuse_standstill(indexes, config.recordings)
