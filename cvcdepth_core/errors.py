@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The errors of the family: every message names the file, topic, camera or field and the value that was found.
+"""The error family: every message names the file, topic, camera or field and the value that was found.
 
 What pydantic finds wrong is worded here too, for one line of such a message.
 """
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class CvcDepthError(Exception):
-    """Anything that is wrong with what came in. Programs print its message as one line and exit."""
+    """Base class: something is wrong with the input. Programs print the message as one line and exit."""
 
 
 class ConfigError(CvcDepthError):
@@ -47,7 +47,7 @@ class NotPromotedError(TrainingError):
 
 
 class OutputError(CvcDepthError):
-    """A result cannot be written: the disk is full, the folder is not there or not ours."""
+    """A result cannot be written: the disk is full, or the folder is missing or write-protected."""
 
 
 class RecordingError(CvcDepthError):

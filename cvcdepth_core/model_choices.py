@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What can be chosen of a model by name: encoder, engine, precision, and the checkpoint that comes with the package.
+"""Names of encoders, engines and precisions, and of the checkpoint that comes with the package.
 
 Settings and command lines are made of these names; nothing here imports torch, so that `--help` stays quick.
 """
@@ -20,7 +20,7 @@ Precision = Literal["float32", "bfloat16", "float16"]
 PRECISIONS: tuple[Precision, ...] = get_args(Precision)
 
 DEFAULT = "default"
-"""What may stand for a checkpoint's path: the small model that lets people see depth before anybody has trained."""
+"""Name of the small model that comes with the package, in the place of a checkpoint's path."""
 
 NOTICE = (
     "default model: trained on three seconds of one street, to try the software and to start training from, not for "
@@ -31,5 +31,5 @@ _PATH = Path(__file__).parent / "models" / "default.safetensors"
 
 
 def checkpoint_path(name: str) -> Path:
-    """Return the file that `name` stands for; nothing and 'default' stand for the model that comes with the package."""
+    """Return the file that `name` stands for; an empty name and 'default' stand for the package's own model."""
     return _PATH if name in ("", DEFAULT) else Path(name).expanduser()

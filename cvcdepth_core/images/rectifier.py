@@ -24,7 +24,7 @@ _REDUCTIONS: tuple[Reduction, ...] = (8, 4, 2)
 
 
 class Rectifier:
-    """Takes one camera's raw pictures to rectified ones of `height` x `width` pixels.
+    """Resamples one camera's raw pictures to rectified ones of `height` x `width` pixels.
 
     `intrinsics` [3, 3] float64 belong to the rectified, resized picture, in its pixels (centres at the integers).
     `visible`, bool [height, width], is False where the rectified picture shows nothing of the raw one: outside it, and
@@ -86,7 +86,7 @@ def raw_pixels(calibration: Calibration, rectified: bool, intrinsics: NDArray[np
 def _pixels_per_network_pixel(
     calibration: Calibration, intrinsics: NDArray[np.float64], rectified: bool
 ) -> NDArray[np.float64]:
-    """How many raw pixels one network pixel is wide and high, in the middle of the picture."""
+    """Return how many raw pixels one network pixel is wide and high, in the middle of the picture."""
     source, _, _ = _raw_view(calibration, rectified)
     ratios: NDArray[np.float64] = (source.diagonal() / intrinsics.diagonal())[:2]
     return ratios
@@ -105,7 +105,7 @@ def _sampling_maps(
     rectified: bool,
     samples_per_network_pixel: NDArray[np.float64],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Where each sample of the fine grid lies in the raw picture: x and y, float32 [H oy, W ox], in pixels."""
+    """Return where each sample of the fine grid lies in the raw picture: x, y, float32 [H oy, W ox], in pixels."""
     source, distortion, rotation = _raw_view(calibration, rectified)
     ox, oy = map(_oversampling, samples_per_network_pixel)
     fine = scale_intrinsics(intrinsics, (ox, oy))
@@ -129,7 +129,7 @@ def _is_fisheye(calibration: Calibration, rectified: bool) -> bool:
 
 
 def _ray_radii(calibration: Calibration, intrinsics: NDArray[np.float64], size: tuple[int, int]) -> NDArray[np.float64]:
-    """Distance [H, W] of each network pixel's ray from the raw camera's axis at z = 1; inf behind the camera."""
+    """Return each network pixel's distance [H, W] from the raw camera's axis at z = 1; inf behind the camera."""
     u, v = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
     raw_from_pixels = calibration.rotation.T @ np.linalg.inv(intrinsics)
     x, y, z = np.tensordot(raw_from_pixels, np.stack([u, v, np.ones_like(u)]), axes=1)
@@ -139,7 +139,7 @@ def _ray_radii(calibration: Calibration, intrinsics: NDArray[np.float64], size: 
 
 
 def _unfolded_radius(calibration: Calibration) -> float:
-    """Radius at z = 1 up to which the distorted radius grows, inf where it always does.
+    """Return the radius at z = 1 up to which the distorted radius grows, inf where it always does.
 
     A distortion polynomial turns back beyond the angles it was fitted to and would show the picture a second time.
     """
@@ -158,5 +158,5 @@ def _unfolded_radius(calibration: Calibration) -> float:
 
 
 def _oversampling(samples_per_network_pixel: float) -> int:
-    """Round up along one axis; bounded for calibrations that zoom far out."""
+    """Return the whole number of samples along one axis, rounded up; bounded for calibrations that zoom far out."""
     return min(max(1, math.ceil(samples_per_network_pixel - 1e-6)), _MAX_OVERSAMPLING)

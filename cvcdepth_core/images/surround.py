@@ -25,7 +25,7 @@ class SurroundPreprocessor:
     """
 
     def __init__(self, rig: Rig, height: int, width: int, known: "SurroundPreprocessor | None" = None) -> None:
-        """Build the maps of every camera; those that `known` has for the same calibration and mask are taken over."""
+        """Build the maps of every camera; those of `known` are reused for an unchanged calibration and mask."""
         keys = {camera.name: _view_key(camera, height, width) for camera in rig.cameras}
         shared = known._views if known is not None else {}
         self._views: dict[tuple[Any, ...], _View] = {
@@ -54,7 +54,7 @@ def _view(camera: Camera, height: int, width: int) -> _View:
 
 
 def _view_key(camera: Camera, height: int, width: int) -> tuple[Any, ...]:
-    """Everything that the maps depend on: all of the camera but where it is mounted."""
+    """Return everything that the maps depend on: all of the camera but its pose."""
     return height, width, *(getattr(camera, f.name) for f in fields(camera) if f.name != "base_T_camera")
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the depths of two views agree, and whether depth explains the pictures.
+"""Agreement of two views: of their depths, and of one picture with the other one rendered into it by depth.
 
 Every comparison is of a view with another one, at another place or moment, by true geometry: a point of the view is
 back-projected, moved to the other view, and its distance there compared with the depth that was estimated there.
@@ -48,10 +48,10 @@ class PosedDepth:
 
 
 class Agreement(NamedTuple):
-    """How one view agrees with another."""
+    """Agreement of one view with another."""
 
     pixels: int
-    """Whose depth could be compared: the other view sees the point, nothing hides it there, and depth is smooth."""
+    """Pixels with comparable depth: the other view sees the point, nothing hides it there, and depth is smooth."""
     median: float
     """Median of the relative difference 2 |z - d| / (z + d) over these pixels; NaN for none."""
     percentile_90: float
@@ -126,7 +126,7 @@ def _compare(views: _TwoViews, max_depth: float) -> tuple[Tensor, Tensor]:
 
 
 def _contradicted(views: _TwoViews, in_other: Tensor, shortening: Tensor) -> Tensor:
-    """Where the view sees through the surface that the other view has on its ray to the point.
+    """Return where the view sees through the surface that the other view has on its ray to the point.
 
     The ray's points [1, 3, H*W] times `shortening` [1, 1, H, W] lie on that surface.
     """

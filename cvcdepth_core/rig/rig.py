@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The rig with everything known: its cameras, where they are mounted, and which of them see the same space."""
+"""The complete rig: its cameras, their calibrations and poses, and which of them see the same space."""
 
 import math
 from collections.abc import Collection, Mapping
@@ -20,7 +20,7 @@ MIN_NEIGHBOUR_OVERLAP_DEG = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """One camera with everything known; the fields are described in `rig_file.CameraEntry`."""
+    """One complete camera; the fields are described in `rig_file.CameraEntry`."""
 
     name: str
     calibration: Calibration
@@ -63,7 +63,7 @@ class Rig:
         return [camera.name for camera in self.cameras]
 
     def only(self, names: Collection[str]) -> "Rig":
-        """Return the rig of these of its cameras; the first of them stands in for an anchor that is left out."""
+        """Return the rig with only these of its cameras; without the anchor, the first of them becomes the anchor."""
         cameras = tuple(camera for camera in self.cameras if camera.name in names)
         anchor = self.anchor if self.anchor in names else cameras[0].name
         return replace(self, cameras=cameras, anchor=anchor)
@@ -77,7 +77,7 @@ class Rig:
 
     @cached_property
     def neighbours(self) -> dict[str, list[str]]:
-        """For each camera the others here that share its view: as the rig file says, else those that overlap enough.
+        """Names of the cameras that share each camera's view: as the rig file says, else those that overlap enough.
 
         Computed neighbours are mutual: a strip that is wide enough in one of two cameras makes both neighbours.
         """

@@ -41,12 +41,12 @@ class PoseEntry(BaseModel):
         return self
 
     def matrix(self, name: str) -> Pose:
-        """Return it as a 4x4 matrix; `name` is what errors call it."""
+        """Return the pose as a 4x4 matrix; errors call it `name`."""
         return pose_from_quaternion(self.translation, self.rotation, name)
 
     @classmethod
     def from_matrix(cls, pose: Pose) -> "PoseEntry":
-        """Take over a 4x4 matrix."""
+        """Return the entry of a 4x4 pose."""
         x, y, z = pose[:3, 3].tolist()
         qx, qy, qz, qw = quaternion_from_rotation(pose[:3, :3]).tolist()
         return cls(translation=(x, y, z), rotation=(qx, qy, qz, qw))
@@ -82,7 +82,7 @@ class CameraEntry(BaseModel):
 
     @property
     def stamp_offset_ns(self) -> int:
-        """`stamp_offset` as stamps are counted: subtracted from one, it gives the time of the exposure."""
+        """`stamp_offset` in nanoseconds: a stamp minus this is the time of the exposure."""
         return round(self.stamp_offset * 10**9)
 
 

@@ -68,7 +68,7 @@ class Finding(NamedTuple):
 
     quantity: Quantity
     cameras: tuple[str, ...]
-    """Whose it is: one camera, or two of which one is meant."""
+    """The camera that has changed, or two of which one has."""
     value: float
     """By how much it differs from the baseline, in its unit (see `MonitorLimits`); the worst of the pairs."""
     since_ns: int
@@ -86,7 +86,7 @@ class Finding(NamedTuple):
 
 
 class PairState(NamedTuple):
-    """What is known of one pair of neighbours; NaN while unknown."""
+    """Measurements of one pair of neighbours; NaN while unknown."""
 
     misalignment: float
     """Degrees by which the turn that makes the pictures agree best has changed against the baseline."""
@@ -99,14 +99,14 @@ class PairState(NamedTuple):
 
 
 class OverlapMonitor:
-    """Follows the overlaps of one rig. Each update takes only the next steps of a round, so that it stays cheap.
+    """Monitor of one rig's overlaps. Each update takes only the next steps of a round, so that it stays cheap.
 
     A round correlates every pair in both directions, compares the depths of every pair, and measures the sharpness of
     every camera; with six cameras and two steps in each of ten sets a second it takes about a second.
     """
 
     def __init__(self, rig: Rig, limits: MonitorLimits | None = None, steps_per_update: int = 2) -> None:
-        """Find the rig's pairs of neighbours."""
+        """Begin without measurements; each update does `steps_per_update` steps of a round."""
         self._limits = limits or MonitorLimits()
         self._names = rig.names
         self._poses = np.stack([camera.base_T_camera for camera in rig.cameras])

@@ -12,7 +12,7 @@ NANOSECONDS = 10**9
 
 
 class Trend:
-    """The mean of the last seconds, and the baseline: a slow mean that stands still while the quantity is off it."""
+    """Mean of the last seconds, and baseline: a slow mean that is not updated while the quantity is abnormal."""
 
     def __init__(self, window: float, baseline: float, learning: float) -> None:
         """Average over `window` seconds, and for the baseline over `baseline`; it is known after `learning` of them."""

@@ -31,7 +31,7 @@ class AgreementRow(NamedTuple):
 
     @property
     def pair(self) -> Pair:
-        """What was compared with what."""
+        """The compared views."""
         return self.kind, self.camera, self.other
 
 
@@ -57,7 +57,7 @@ class AgreementTable:
 
     @property
     def pairs(self) -> list[Pair]:
-        """What was compared with what."""
+        """The compared views, in the order in which they were first added."""
         return list(self._pairs)
 
     @property

@@ -80,7 +80,7 @@ def downsample_ground_truth(depth: NDArray[np.float32], height: int, width: int)
 def _interpolation(
     positions: NDArray[np.int64], large: int, small: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Between which pixels of `small`, and how far, lie pixels of an axis of `large`; borders are continued."""
+    """Return for pixels of an axis of `large` their two neighbours of `small`, and the weight of the second."""
     at = np.clip((positions + 0.5) * small / large - 0.5, 0, small - 1)
     first = np.floor(at).astype(np.int64)
     return first, np.minimum(first + 1, small - 1), at - first

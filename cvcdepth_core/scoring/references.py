@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Predictors that look at no picture: what any network must beat."""
+"""Reference predictors that look at no picture; any useful network beats them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ REFERENCE_HEIGHT, REFERENCE_WIDTH = 384, 640
 
 
 class ReferenceSize(NamedTuple):
-    """The size of the pictures, pixels."""
+    """Size of the pictures in pixels."""
 
     height: int
     width: int

@@ -16,7 +16,7 @@ from cvcdepth_core.scoring.scores import SCALINGS, Measurements, Scores, ScoreSe
 
 
 class DepthSamples(NamedTuple):
-    """One image's truth and the prediction there."""
+    """Truth of one image, and the prediction at the same pixels."""
 
     prediction: NDArray[np.float64]
     """[M] metres, NaN where there is none."""
@@ -30,7 +30,7 @@ class SurroundScorer:
     """Measures the sets of one recording, in order."""
 
     def __init__(self, recording: str, cameras: Sequence[str], settings: ScoreSettings) -> None:
-        """Name the `recording` as no other recording of the evaluation is named."""
+        """Begin without sets; the name `recording` is unique within the evaluation."""
         self._settings = settings
         self._cameras = tuple(cameras)
         self._images, self._pools = (_Columns(recording, self._cameras, len(settings.groups)) for _ in range(2))
@@ -51,7 +51,7 @@ class SurroundScorer:
         return sum(len(image.truth) for image in valid)
 
     def scores(self) -> Scores:
-        """Return what was measured so far."""
+        """Return the scores of the sets so far."""
         return Scores(self._settings, (self._images.table(),), (self._pools.table(),))
 
     def _close_pool(self) -> None:

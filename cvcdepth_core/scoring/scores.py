@@ -39,7 +39,7 @@ def mean(values: Sequence[float]) -> float:
 
 
 class ScoreSettings(BaseModel):
-    """What is measured; numbers of different settings must not be compared."""
+    """Settings of a measurement; numbers of different settings must not be compared."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
@@ -74,7 +74,7 @@ class ScoreSettings(BaseModel):
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
-    """What was measured of one recording, in columns: 0.7 kB for an image, or for a pool of images, of a camera."""
+    """Measurements of one recording, in columns: 0.7 kB for an image, or for a pool of images, of a camera."""
 
     recording: str
     cameras: tuple[str, ...]
@@ -99,7 +99,7 @@ class Measurements:
         return self.scales[:, self.cameras.index(camera)] if camera in self.cameras else self.scales[:0, 0]
 
     def to_json(self) -> dict[str, Any]:
-        """Return it with JSON's types: the columns compressed, as the bytes of little-endian numbers."""
+        """Return the content for JSON: the columns compressed, as the bytes of little-endian numbers."""
         columns = b"".join(
             np.ascontiguousarray(column).tobytes() for column in (self.stamps_ns, self.scales, self.sums)
         )
@@ -109,7 +109,7 @@ class Measurements:
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> Measurements:
-        """Undo `to_json`."""
+        """Return what `to_json` was called on."""
         cameras, sets, groups = tuple(content["cameras"]), int(content["sets"]), int(content["groups"])
         shapes: dict[np.dtype[Any], tuple[int, ...]] = {
             np.dtype("<i8"): (sets,),
@@ -135,10 +135,10 @@ class Score(NamedTuple):
     truth: int
     """Truth pixels."""
     measurements: int
-    """Images or pools that the metrics are the mean of."""
+    """Images or pools that the metrics are averaged over."""
 
     def to_json(self) -> dict[str, Any]:
-        """Return it with JSON's types; what is NaN is null."""
+        """Return the content for JSON, NaN as null."""
         counts = {"truth_points": self.truth, "measurements": self.measurements}
         return nan_to_null(self.metrics | {"coverage": self.coverage}) | counts
 
@@ -147,19 +147,19 @@ class Summary(NamedTuple):
     """The scores by group of pixels."""
 
     cameras: dict[str, dict[str, Score]]
-    """Of each camera: the mean over its measurements."""
+    """Mean over the measurements of each camera."""
     mean: dict[str, Score]
-    """The mean over the cameras that have a value."""
+    """Mean over the cameras that have a value."""
 
     def to_json(self) -> dict[str, Any]:
-        """Return it with JSON's types."""
+        """Return the content for JSON."""
         cameras = {name: _json_by_group(scores) for name, scores in self.cameras.items()}
         return {"mean": _json_by_group(self.mean), "cameras": cameras}
 
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """What was measured of one or many recordings, sorted by their names."""
+    """Measurements of one or many recordings, sorted by their names."""
 
     settings: ScoreSettings
     images: tuple[Measurements, ...]
@@ -187,7 +187,7 @@ class Scores:
         return list(dict.fromkeys(camera for table in self.images if len(table) for camera in table.cameras))
 
     def summary(self, protocol: EvaluationProtocol = "image", scaling: Scaling = "metric") -> Summary:
-        """Take the means: per camera over its measurements, then over the cameras."""
+        """Return the means: per camera over its measurements, then over the cameras."""
         tables = self.images if protocol == "image" else self.pools
         cameras = {}
         for camera in self.cameras:
@@ -205,7 +205,7 @@ class Scores:
         return {camera: _geometric_mean([table.scales_of(camera) for table in tables]) for camera in self.cameras}
 
     def to_json(self) -> dict[str, Any]:
-        """Return everything with JSON's types."""
+        """Return the content for JSON."""
         return {
             "settings": self.settings.model_dump(mode="json"),
             "images": [table.to_json() for table in self.images],
@@ -214,7 +214,7 @@ class Scores:
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> Scores:
-        """Undo `to_json`. Raises ConfigError when `content` was not written by it."""
+        """Return what `to_json` was called on. Raises ConfigError when `content` was not written by it."""
         try:
             images, pools = (tuple(map(Measurements.from_json, content[key])) for key in ("images", "pools"))
             return cls(ScoreSettings.model_validate(content["settings"]), images, pools)

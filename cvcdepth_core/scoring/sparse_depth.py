@@ -39,7 +39,7 @@ class SparseDepth:
         return cls(rows, columns, depth[rows, columns].astype(np.float64), *depth.shape)
 
     def image(self) -> NDArray[np.float32]:
-        """Return it as a depth image [H, W] in metres, NaN where unknown."""
+        """Return the depth image [H, W] in metres, NaN where unknown."""
         image = np.full((self.height, self.width), np.nan, dtype=np.float32)
         image[self.rows, self.columns] = self.depth
         return image
@@ -50,7 +50,7 @@ class SparseDepth:
 
 @dataclass(frozen=True)
 class OcclusionFilter:
-    """Which LiDAR points a camera cannot see, since a nearer surface hides them from where the camera is.
+    """Filter of LiDAR points that a camera cannot see, since a nearer surface hides them from its place.
 
     A point is hidden when a point within `radius` of it in the picture is nearer than any smooth surface through both
     would be: the inverse depth of a plane that passes `clearance` metres from the camera changes by at most
@@ -70,7 +70,7 @@ class OcclusionFilter:
                 raise ConfigError(f"occlusion filter: {name} is {getattr(self, name)}, must be positive")
 
     def visible(self, truth: SparseDepth, focal_length: float) -> NDArray[np.bool_]:
-        """Return which points [M] of `truth` nothing hides; `focal_length` in its pixels."""
+        """Return which points [M] of `truth` are not hidden; `focal_length` in its pixels."""
         hidden = np.zeros(len(truth), dtype=bool)
         if not len(truth):
             return ~hidden
@@ -98,7 +98,7 @@ def _nearest_in_cells(truth: SparseDepth, cell: int, border: int) -> tuple[NDArr
 
 
 def _offsets_within(radius: int) -> Iterator[tuple[int, int]]:
-    """Give the (row, column) offsets of a disc, without its centre."""
+    """Yield the (row, column) offsets of a disc, without its centre."""
     for row in range(-radius, radius + 1):
         half = math.isqrt(radius * radius - row * row)
         yield from ((row, column) for column in range(-half, half + 1) if (row, column) != (0, 0))

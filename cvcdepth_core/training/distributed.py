@@ -27,7 +27,7 @@ _PATIENCE = timedelta(hours=12)
 
 @dataclass(frozen=True)
 class Processes:
-    """The processes that compute a run together; by default, this one alone."""
+    """The processes that compute a run together; by default this single one."""
 
     rank: int = 0
     """This process's number; only the first, 0, writes and reports."""
@@ -46,7 +46,7 @@ class Processes:
         return values
 
     def sum_gradients_over_processes(self, parameters: Sequence[nn.Parameter]) -> None:
-        """Replace the gradients by their sums over the processes, all in one message."""
+        """Replace the gradients by their sums over the processes, in one message."""
         gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
         if self.count == 1 or not gradients:
             return
@@ -64,7 +64,7 @@ class Processes:
 
     @contextmanager
     def first_process_first(self) -> Iterator[None]:
-        """Let the others begin the block when the first is through with it: it leaves there what they find."""
+        """Run the block in the first process before it begins in the others, which find what the first has written."""
         if not self.is_first:
             self.broadcast_from_first(b"")
         yield
@@ -78,7 +78,7 @@ SINGLE_PROCESS = Processes()
 
 @contextmanager
 def launched_processes() -> Iterator[Processes]:
-    """Join the other processes that torchrun started; without torchrun, or with one process, this one is alone."""
+    """Join the other processes that torchrun started; without torchrun, or with one process, there is only this one."""
     count = int(os.environ["WORLD_SIZE"]) if distributed.is_torchelastic_launched() else 1
     if count == 1:
         yield SINGLE_PROCESS
@@ -114,7 +114,7 @@ def share_batch_statistics(network: nn.Module, device: torch.device) -> nn.Modul
 
 
 class _SharedBatchNorm(nn.BatchNorm2d):
-    """What torch's SyncBatchNorm computes, for CPUs, which that does not support."""
+    """Batch normalisation over all processes on CPUs, which torch's SyncBatchNorm does not support."""
 
     momentum: float
     running_mean: Tensor

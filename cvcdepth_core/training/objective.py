@@ -50,7 +50,7 @@ class ObjectiveConfig(BaseModel):
 
 @dataclass(frozen=True)
 class Prediction:
-    """What the networks say about a `RigBatch`, mirrored back if they saw it mirrored."""
+    """Output of the networks for a `RigBatch`, mirrored back if they saw it mirrored."""
 
     disparity: Tensor
     """[B, N, 1, H, W] in (0, 1)."""
@@ -60,13 +60,13 @@ class Prediction:
     """[B, F, N, 4, 4] pose `context_T_target` of each camera for each context frame."""
 
     def first_sample(self) -> Prediction:
-        """Return what is said about the first sample, without its gradient."""
+        """Return the output for the first sample, without its gradient."""
         return Prediction(*(part[:1].detach() for part in (self.disparity, self.depth, self.motions)))
 
 
 @dataclass(frozen=True)
 class Overlap:
-    """Views of every camera put together from its neighbours."""
+    """Views of every camera rendered from its neighbours' images."""
 
     images: Tensor
     """[B, 1 + F, N, 3, H, W], intensity aligned; frame 0 is spatial, the others spatio-temporal."""
@@ -78,7 +78,7 @@ class Overlap:
 
 @dataclass(frozen=True)
 class Views:
-    """Everything that is rendered for one step."""
+    """All views that are rendered for one step."""
 
     temporal: Tensor
     """[B, F, N, 3, H, W] each camera rendered from its own context frames, intensity aligned."""
