@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The error family: every message names the file, topic, camera or field and the value that was found.
 
-What pydantic finds wrong is worded here too, for one line of such a message.
+What pydantic finds wrong is worded here too: one line that names the field and the value.
 """
 
 from __future__ import annotations
