@@ -15,11 +15,11 @@ import torch
 from torch import Tensor
 
 from cvcdepth_core.networks import disparity_to_depth
-from cvcdepth_core.rendering.photometric import photometric_error
+from cvcdepth_core.rendering.photometric import masked_mean, photometric_error
 from cvcdepth_core.rendering.projection import back_project, rigid_inverse, transform
 from cvcdepth_core.rendering.view_synthesis import align_intensity, sample, warp_views
 from cvcdepth_core.training.batch import RigBatch
-from cvcdepth_core.training.losses import auto_mask, masked_mean, smoothness
+from cvcdepth_core.training.losses import auto_mask, smoothness
 from cvcdepth_core.training.model import SurroundModel, rig_images
 from cvcdepth_core.training.objective import ObjectiveConfig, Prediction
 

@@ -18,7 +18,7 @@ import numpy as np
 from measuring import json_lines, measure_in_turns, print_line
 from numpy.typing import NDArray
 
-from cvcdepth_core.images.rectifier import SurroundPreprocessor
+from cvcdepth_core.images.surround import SurroundPreprocessor
 from cvcdepth_core.pointcloud import CloudLimits, merged_cloud
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.surround_depth import SurroundDepth

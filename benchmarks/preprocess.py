@@ -19,7 +19,8 @@ import numpy as np
 from measuring import json_lines, measure_in_turns, print_line
 
 from cvcdepth_core.images.decoding import Picture
-from cvcdepth_core.images.rectifier import Rectifier, SurroundPreprocessor, to_tensor
+from cvcdepth_core.images.rectifier import Rectifier
+from cvcdepth_core.images.surround import SurroundPreprocessor, to_tensor
 from cvcdepth_core.rig.rig import Camera, Rig
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.messages.conversion import picture_from_message

@@ -33,7 +33,8 @@ from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 
 from cvcdepth_core.estimator import DepthPredictor
-from cvcdepth_core.rig.calibration import Calibration, scale_intrinsics
+from cvcdepth_core.rig.calibration import Calibration
+from cvcdepth_core.rig.pinhole import scale_intrinsics
 from cvcdepth_core.rig.poses import Pose, inverse, pose_from_quaternion
 from cvcdepth_core.rig.rig import Camera, Rig
 from cvcdepth_core.surround_depth import SurroundPictures

@@ -9,9 +9,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from cvcdepth_core.engines import Precision, build_engine
+from cvcdepth_core.engines import build_engine
 from cvcdepth_core.images.decoding import Picture
-from cvcdepth_core.images.rectifier import SurroundPreprocessor
+from cvcdepth_core.images.surround import SurroundPreprocessor
+from cvcdepth_core.model_choices import Precision
 from cvcdepth_core.networks import DepthNetwork, build_depth_network, disparity_to_depth
 from cvcdepth_core.networks.checkpoint import load_checkpoint
 from cvcdepth_core.networks.registry import DepthModelSpec

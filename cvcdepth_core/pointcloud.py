@@ -24,7 +24,7 @@ _GOLDEN = 0x9E3779B97F4A7C15  # 2^64 over the golden ratio: Fibonacci hashing (K
 
 @dataclass(frozen=True)
 class CloudLimits:
-    """Which pixels the merged cloud takes."""
+    """Which pixels become points of the merged cloud."""
 
     stride: int = 1
     """Every n-th row and column."""
@@ -73,7 +73,7 @@ def _append(view: "_View", rows: slice, limits: CloudLimits, free: Cloud) -> int
 
 
 class _View:
-    """One camera's pixels on their way to points, a few rows at a time, so that all steps stay in the cache."""
+    """One camera's pixels, back-projected a few rows at a time, so that all steps stay in the cache."""
 
     def __init__(
         self,
@@ -92,7 +92,7 @@ class _View:
         self._planes = np.empty((3, _BLOCK_ROWS, len(u)), dtype=np.float32)
 
     def blocks(self) -> Iterator[slice]:
-        """Give the rows of one block after the other."""
+        """Yield the rows of one block after the other."""
         return (slice(begin, begin + _BLOCK_ROWS) for begin in range(0, len(self.depth), _BLOCK_ROWS))
 
     def project(self, rows: slice, points: Cloud) -> None:
@@ -104,14 +104,6 @@ class _View:
         cv2.merge([*xyz, pack_rgb(self._picture[rows])], dst=points)
 
 
-def pixel_rays(intrinsics: NDArray[np.float64], height: int, width: int) -> NDArray[np.float32]:
-    """Rays (x, y, 1) [H, W, 3] through the pixel centres, in the optical frame."""
-    u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
-    pixels = np.stack([u, v, np.ones_like(u)], axis=-1)
-    rays: NDArray[np.float64] = pixels @ np.linalg.inv(intrinsics).T
-    return rays.astype(np.float32)
-
-
 def pack_rgb(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Pack RGB [H, W, 3] into float32 [H, W] whose bits are 0x00RRGGBB, the `rgb` field that RViz and PCL read."""
     packed = np.zeros((*picture.shape[:2], 4), dtype=np.uint8)
@@ -120,7 +112,7 @@ def pack_rgb(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def thinned(points: Cloud, edge: float) -> Cloud:
-    """Keep of the points [M, 4] the first in each cube of `edge` metres, in their order.
+    """Return the first of the points [M, 4] in each cube of `edge` metres, in their order.
 
     A hash table without chains: in every round each slot goes to one voxel, and those that did not get one try again.
     """
@@ -140,7 +132,7 @@ def thinned(points: Cloud, edge: float) -> Cloud:
 
 
 def _voxels(points: Cloud, edge: float) -> NDArray[np.uint64]:
-    """Give the cubes that the points lie in their numbers [M]."""
+    """Return the number [M] of the cube that each point lies in."""
     numbers = np.zeros(len(points), dtype=np.uint64)
     mask = np.uint64(2**_VOXEL_BITS - 1)
     for axis in range(3):

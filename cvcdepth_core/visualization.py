@@ -39,7 +39,7 @@ _TICKS = (1, 2, 5, 10, 20, 40, 80, 160)
 
 @dataclass(frozen=True)
 class DepthScale:
-    """Which depths have which colour: logarithmic from `near` (red) to `far` (dark blue), both in metres."""
+    """Colour scale of depth: logarithmic from `near` (red) to `far` (dark blue), both in metres."""
 
     near: float = 1.0
     far: float = 80.0
@@ -58,7 +58,7 @@ class DepthScale:
         return colours
 
     def ticks(self) -> list[float]:
-        """Round depths within the scale."""
+        """Return round depths within the scale, metres."""
         return [tick for tick in _TICKS if self.near <= tick <= self.far]
 
 
@@ -70,7 +70,7 @@ class TopDownView:
     height: int
     pixels_per_metre: float
     centre: tuple[float, float] = (0.0, 0.0)
-    """x, y in metres of what is in the picture's middle."""
+    """x, y in metres of the picture's centre."""
 
     def pixels(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
         """Return column and row [..., 2] of points [..., 2 or more] in the base frame, metres."""
@@ -100,21 +100,21 @@ class ColouredPoints(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SurroundPictures:
-    """What one contact sheet shows; the arrays hold the cameras in the rig's order."""
+    """Content of one contact sheet; arrays hold the cameras in the rig's order."""
 
     pictures: NDArray[np.uint8]
     """[N, H, W, 3] RGB."""
     depth: NDArray[np.float32]
     """[N, H, W] metres, NaN where unknown: pixel by pixel that of `pictures`."""
     cloud: ColouredPoints
-    """The cloud that was made of the depth."""
+    """Point cloud of the depth."""
     lidar: Points | None
     """[M, 3] metres in the base frame at the anchor's stamp."""
     title: str
     captions: Sequence[str] = ()
     """Lines below the pictures."""
     warning: str = ""
-    """What nobody may overlook."""
+    """Shown in the header."""
 
 
 def contact_sheet(rig: Rig, shown: SurroundPictures, scale: DepthScale | None = None) -> Picture:

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
-from cvcdepth_core.errors import ConfigError
-from cvcdepth_core.model_choices import DEFAULT, NOTICE, checkpoint_path
-from cvcdepth_core.rig.calibration import first_validation_message
+from cvcdepth_core.errors import ConfigError, first_validation_message
+from cvcdepth_core.model_choices import DEFAULT, NOTICE, Backend, Precision, checkpoint_path
 
 if TYPE_CHECKING:
     from cvcdepth_core.estimator import DepthEstimator
@@ -44,9 +43,9 @@ class ModelSettings(Settings):
     """Untrained network only: columns of its input. A checkpoint names its own."""
     device: str = "auto"
     """Where inference runs: auto (CUDA where there is one), cpu, cuda, cuda:1 ..."""
-    backend: Literal["auto", "ncnn", "torch", "torch_eager", "torch_compiled", "onnxruntime", "tensorrt"] = "auto"
+    backend: Backend = "auto"
     """What runs the network: auto (on a CPU ncnn where it is installed, else torch) or one by name."""
-    precision: Literal["float32", "bfloat16", "float16"] = "float32"
+    precision: Precision = "float32"
     """In what a CUDA device computes; CPUs know float32 only."""
     cpu_fallback: bool = False
     """Go on with the CPU, more slowly, when the GPU fails, or its memory is too small even for one camera."""

@@ -18,7 +18,7 @@ from rclpy.utilities import remove_ros_args
 
 from cvcdepth_core.errors import CvcDepthError
 from cvcdepth_core.estimator import DepthEstimator
-from cvcdepth_core.rig.rig import RigLayout, load_rig_layout
+from cvcdepth_core.rig.rig_file import RigLayout, load_rig_layout
 from cvcdepth_ros.live.camera_states import CameraCondition, CameraState
 from cvcdepth_ros.live.process_setup import prepare_process, return_memory
 from cvcdepth_ros.messages.rig_assembly import RigAssembler

@@ -18,7 +18,7 @@ from typing import Any
 from cvcdepth_core.errors import CvcDepthError
 from cvcdepth_core.images.decoding import Reduction, decode_compressed, decode_raw
 from cvcdepth_core.images.rectifier import Rectifier
-from cvcdepth_core.rig.rig import load_rig_layout
+from cvcdepth_core.rig.rig_file import load_rig_layout
 from cvcdepth_ros.bags import Recording, open_recording, typestore
 from cvcdepth_ros.messages.conversion import calibration_from_message, picture_from_message, stamp_ns
 from cvcdepth_ros.messages.transforms import TransformTree

@@ -23,7 +23,7 @@ import cv2
 import torch
 
 from cvcdepth_core.networks.checkpoint import load_checkpoint
-from cvcdepth_core.rig.rig import load_rig_layout
+from cvcdepth_core.rig.rig_file import load_rig_layout
 from cvcdepth_core.training.config import TrainingConfig, load_training_config
 from cvcdepth_core.training.run_folder import CHECKPOINT_FILE
 from cvcdepth_core.training.starting_model import build_surround_model

@@ -2,16 +2,13 @@
 """What every inference engine offers."""
 
 from collections.abc import Callable
-from typing import Literal, Protocol
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from cvcdepth_core.errors import EngineError
 from cvcdepth_core.networks import DepthNetwork, RigImages
-
-Precision = Literal["float32", "bfloat16", "float16"]
-"""In what an engine computes; depth is float32 always."""
 
 
 class DeviceMemoryError(EngineError):

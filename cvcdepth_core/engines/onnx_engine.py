@@ -16,10 +16,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from cvcdepth_core.engines.engine import DeviceMemoryError, Precision, best_chunk, image_by_image
+from cvcdepth_core.engines.engine import DeviceMemoryError, best_chunk, image_by_image
 from cvcdepth_core.engines.example_rigs import ring_of_cameras
 from cvcdepth_core.engines.rewriting import RewrittenDepthNet
 from cvcdepth_core.errors import EngineError
+from cvcdepth_core.model_choices import Precision
 from cvcdepth_core.networks import DepthNet, DepthNetwork, RigImages
 from cvcdepth_core.networks.registry import DepthModelSpec
 

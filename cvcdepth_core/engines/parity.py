@@ -7,9 +7,10 @@ import copy
 
 import torch
 
-from cvcdepth_core.engines.engine import DisparityEngine, Precision
+from cvcdepth_core.engines.engine import DisparityEngine
 from cvcdepth_core.engines.example_rigs import ring_of_cameras
 from cvcdepth_core.errors import EngineError
+from cvcdepth_core.model_choices import Precision
 from cvcdepth_core.networks import DepthNetwork, RigImages, disparity_to_depth
 from cvcdepth_core.networks.registry import DepthModelSpec
 

@@ -6,21 +6,17 @@ from __future__ import annotations
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal, get_args
 
 import torch
 
-from cvcdepth_core.engines.engine import DisparityEngine, Precision
+from cvcdepth_core.engines.engine import DisparityEngine
 from cvcdepth_core.engines.guarded_engine import GuardedEngine
 from cvcdepth_core.engines.parity import check_parity
 from cvcdepth_core.engines.torch_engine import TorchEagerEngine, TorchEngine
 from cvcdepth_core.errors import ConfigError, EngineError
+from cvcdepth_core.model_choices import BACKENDS, Precision
 from cvcdepth_core.networks import DepthNet, DepthNetwork
 from cvcdepth_core.networks.registry import DepthModelSpec
-
-Backend = Literal["auto", "ncnn", "torch", "torch_eager", "torch_compiled", "onnxruntime", "tensorrt"]
-
-BACKENDS: tuple[str, ...] = get_args(Backend)
 
 # What has to be importable, and how to get it.
 _PACKAGES = {

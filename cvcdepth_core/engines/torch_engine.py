@@ -9,8 +9,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from cvcdepth_core.engines.engine import Precision, best_chunk, image_by_image
+from cvcdepth_core.engines.engine import best_chunk, image_by_image
 from cvcdepth_core.engines.rewriting import RewrittenDepthNet
+from cvcdepth_core.model_choices import Precision
 from cvcdepth_core.networks import DepthNet, DepthNetwork, RigImages
 
 

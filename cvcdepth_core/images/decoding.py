@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvcdepth_core.errors import ImageError
-from cvcdepth_core.images.headers import JPEG_START, MAX_PIXELS, PNG_START, ImageHeader, read_header
+from cvcdepth_core.images.headers import JPEG_START, PNG_START, ImageHeader, read_header
+from cvcdepth_core.rig.calibration import MAX_PIXELS
 
 Picture = NDArray[np.uint8]
 

@@ -8,9 +8,6 @@ them. The walk through a JPEG's segments is libjpeg's own, so that no header can
 import re
 from typing import Literal, NamedTuple
 
-MAX_PIXELS = 50_000_000
-"""Pixels of the largest picture that is decoded unless the caller says otherwise; each takes up to 16 bytes then."""
-
 JPEG_START, PNG_START = b"\xff\xd8", b"\x89PNG\r\n\x1a\n"
 
 _MARKER = re.compile(rb"\xff([\x01-\xfe])")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a camera's picture to what the network sees, for the node, the bag tool and the trainer alike.
+"""From a camera's raw picture to the rectified one that the network sees: for the node, the bag tool and the trainer.
 
 Undistorting, rectifying and resizing happen in one resampling whose maps are built once per calibration. The picture is
 sampled on a grid that is finer than the network's by whole numbers, at least as fine as the picture itself, and the
@@ -9,27 +9,22 @@ while they decode, in less than half the time.
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import fields
-from pathlib import Path
-from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from cvcdepth_core.errors import ImageError, RigError
+from cvcdepth_core.errors import ImageError
 from cvcdepth_core.images.decoding import Picture, Reduction, reduce_picture
-from cvcdepth_core.rig.calibration import Calibration, scale_intrinsics
-from cvcdepth_core.rig.rig import Camera, Rig
+from cvcdepth_core.rig.calibration import Calibration
+from cvcdepth_core.rig.pinhole import scale_intrinsics
 
 _MAX_OVERSAMPLING = 8
 _REDUCTIONS: tuple[Reduction, ...] = (8, 4, 2)
 
 
 class Rectifier:
-    """Takes one camera's raw pictures to rectified ones of `height` x `width` pixels.
+    """Resamples one camera's raw pictures to rectified ones of `height` x `width` pixels.
 
     `intrinsics` [3, 3] float64 belong to the rectified, resized picture, in its pixels (centres at the integers).
     `visible`, bool [height, width], is False where the rectified picture shows nothing of the raw one: outside it, and
@@ -78,86 +73,6 @@ class Rectifier:
         return resized
 
 
-class SurroundPreprocessor:
-    """The rectifiers of a whole rig.
-
-    `intrinsics` [N, 3, 3] float64 belong to the network's pictures. `valid`, bool [N, H, W], is False outside the raw
-    picture and where the vehicle itself is in view.
-    """
-
-    def __init__(self, rig: Rig, height: int, width: int, known: "SurroundPreprocessor | None" = None) -> None:
-        """Build the maps of every camera; those that `known` has for the same calibration and mask are taken over."""
-        keys = {camera.name: _view_key(camera, height, width) for camera in rig.cameras}
-        shared = known._views if known is not None else {}
-        self._views: dict[tuple[Any, ...], _View] = {
-            keys[camera.name]: shared.get(keys[camera.name]) or _view(camera, height, width) for camera in rig.cameras
-        }
-        views = {name: self._views[key] for name, key in keys.items()}
-        self.rectifiers = {name: view.rectifier for name, view in views.items()}
-        """By the cameras' names, in the rig's order."""
-        self.intrinsics = np.stack([rectifier.intrinsics for rectifier in self.rectifiers.values()])
-        self.valid: NDArray[np.bool_] = np.stack([view.valid for view in views.values()])
-
-    def rectify(self, index: int, picture: Picture, reduced: Reduction = 1) -> Picture:
-        """Rectify and resize one camera's picture, by its index in the rig."""
-        name = list(self.rectifiers)[index]
-        return self.rectifiers[name](picture, name, reduced)
-
-
-class _View(NamedTuple):
-    rectifier: Rectifier
-    valid: NDArray[np.bool_]
-
-
-def _view(camera: Camera, height: int, width: int) -> _View:
-    rectifier = Rectifier(camera.calibration, height, width, camera.rectified)
-    return _View(rectifier, rectifier.visible & (self_occlusion_mask(camera, rectifier) > 0.5))
-
-
-def _view_key(camera: Camera, height: int, width: int) -> tuple[Any, ...]:
-    """Everything that the maps depend on: all of the camera but where it is mounted."""
-    return height, width, *(getattr(camera, f.name) for f in fields(camera) if f.name != "base_T_camera")
-
-
-def to_tensor(pictures: Sequence[Picture], device: torch.device | str = "cpu") -> torch.Tensor:
-    """Stack RGB pictures [H, W, 3] into the network's input: float32 [N, 3, H, W] in [0, 1]."""
-    stacked = torch.from_numpy(np.stack(pictures)).to(device)
-    return stacked.permute(0, 3, 1, 2).to(torch.float32).contiguous() / 255.0
-
-
-def self_occlusion_mask(camera: Camera, rectifier: Rectifier) -> NDArray[np.float32]:
-    """Return the camera's mask at the network's size, float32 [H, W] in [0, 1], 1 = valid, with soft edges (method, 2).
-
-    Without mask file and polygons everything is valid. RigError names a file that cannot be read or has another size.
-    """
-    if camera.mask is None and not camera.mask_polygons:
-        return np.ones((rectifier.height, rectifier.width), dtype=np.float32)
-    try:
-        return rectifier(_raw_mask(camera), camera.name).astype(np.float32) / 255.0
-    except ImageError as error:
-        raise RigError(f"mask {camera.mask}: {error}") from error
-
-
-def _raw_mask(camera: Camera) -> NDArray[np.uint8]:
-    """Return the mask file's content with the polygons drawn in, 0 on the vehicle and 255 elsewhere."""
-    width, height = camera.calibration.image_size
-    mask = np.full((height, width), 255, np.uint8) if camera.mask is None else _read_mask(camera.mask, camera.name)
-    for polygon in camera.mask_polygons:
-        cv2.fillPoly(mask, [np.round(polygon).astype(np.int32)], 0)
-    return mask
-
-
-def _read_mask(path: Path, camera: str) -> NDArray[np.uint8]:
-    try:
-        mask = cv2.imdecode(np.frombuffer(path.read_bytes(), dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
-    except (OSError, cv2.error) as error:
-        raise RigError(f"camera {camera}: mask {path} cannot be read: {error}") from error
-    if mask is None:
-        raise RigError(f"camera {camera}: mask {path} is not an image")
-    found: NDArray[np.uint8] = mask
-    return found
-
-
 def raw_pixels(calibration: Calibration, rectified: bool, intrinsics: NDArray[np.float64]) -> NDArray[np.float32]:
     """Return where each pixel of the raw image lies in the rectified picture with `intrinsics`, float32 [h, w, 2]."""
     width, height = calibration.image_size
@@ -171,7 +86,7 @@ def raw_pixels(calibration: Calibration, rectified: bool, intrinsics: NDArray[np
 def _pixels_per_network_pixel(
     calibration: Calibration, intrinsics: NDArray[np.float64], rectified: bool
 ) -> NDArray[np.float64]:
-    """How many raw pixels one network pixel is wide and high, in the middle of the picture."""
+    """Return how many raw pixels one network pixel is wide and high, in the middle of the picture."""
     source, _, _ = _raw_view(calibration, rectified)
     ratios: NDArray[np.float64] = (source.diagonal() / intrinsics.diagonal())[:2]
     return ratios
@@ -190,7 +105,7 @@ def _sampling_maps(
     rectified: bool,
     samples_per_network_pixel: NDArray[np.float64],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Where each sample of the fine grid lies in the raw picture: x and y, float32 [H oy, W ox], in pixels."""
+    """Return where each sample of the fine grid lies in the raw picture: x, y, float32 [H oy, W ox], in pixels."""
     source, distortion, rotation = _raw_view(calibration, rectified)
     ox, oy = map(_oversampling, samples_per_network_pixel)
     fine = scale_intrinsics(intrinsics, (ox, oy))
@@ -214,7 +129,7 @@ def _is_fisheye(calibration: Calibration, rectified: bool) -> bool:
 
 
 def _ray_radii(calibration: Calibration, intrinsics: NDArray[np.float64], size: tuple[int, int]) -> NDArray[np.float64]:
-    """Distance [H, W] of each network pixel's ray from the raw camera's axis at z = 1; inf behind the camera."""
+    """Return each network pixel's distance [H, W] from the raw camera's axis at z = 1; inf behind the camera."""
     u, v = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
     raw_from_pixels = calibration.rotation.T @ np.linalg.inv(intrinsics)
     x, y, z = np.tensordot(raw_from_pixels, np.stack([u, v, np.ones_like(u)]), axes=1)
@@ -224,7 +139,7 @@ def _ray_radii(calibration: Calibration, intrinsics: NDArray[np.float64], size: 
 
 
 def _unfolded_radius(calibration: Calibration) -> float:
-    """Radius at z = 1 up to which the distorted radius grows, inf where it always does.
+    """Return the radius at z = 1 up to which the distorted radius grows, inf where it always does.
 
     A distortion polynomial turns back beyond the angles it was fitted to and would show the picture a second time.
     """
@@ -243,5 +158,5 @@ def _unfolded_radius(calibration: Calibration) -> float:
 
 
 def _oversampling(samples_per_network_pixel: float) -> int:
-    """Round up along one axis; bounded for calibrations that zoom far out."""
+    """Return the whole number of samples along one axis, rounded up; bounded for calibrations that zoom far out."""
     return min(max(1, math.ceil(samples_per_network_pixel - 1e-6)), _MAX_OVERSAMPLING)

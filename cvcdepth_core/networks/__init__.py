@@ -2,20 +2,18 @@
 """The depth networks behind one seam, and the pose network."""
 
 from cvcdepth_core.networks.depth import INPUT_STRIDE, DepthNet, disparity_to_depth
-from cvcdepth_core.networks.encoders import ENCODERS, Encoder, EncoderName
+from cvcdepth_core.networks.encoders import Encoder
 from cvcdepth_core.networks.pose import PoseNet
 from cvcdepth_core.networks.registry import NETWORKS, DepthModelSpec, build_depth_network
 from cvcdepth_core.networks.rig_images import DepthNetwork, RigImages
 
 __all__ = [
-    "ENCODERS",
     "INPUT_STRIDE",
     "NETWORKS",
     "DepthModelSpec",
     "DepthNet",
     "DepthNetwork",
     "Encoder",
-    "EncoderName",
     "PoseNet",
     "RigImages",
     "build_depth_network",

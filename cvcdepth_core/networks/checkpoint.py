@@ -18,7 +18,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from cvcdepth_core.errors import CheckpointError
+from cvcdepth_core.errors import CheckpointError, validation_messages
 from cvcdepth_core.files import write_atomically
 from cvcdepth_core.networks.encoders import Encoder
 from cvcdepth_core.networks.registry import DepthModelSpec, build_depth_network
@@ -199,11 +199,7 @@ def _parse_spec(path: Path, text: str | None) -> DepthModelSpec:
     try:
         return DepthModelSpec.model_validate_json(text)
     except ValidationError as error:
-        wrong = "; ".join(
-            f"{'.'.join(map(str, item['loc'])) or 'spec'} is {item['input']!r}: {item['msg']}"
-            for item in error.errors(include_url=False)
-        )
-        raise CheckpointError(f"{path}: {wrong}") from error
+        raise CheckpointError(f"{path}: spec: {validation_messages(error, DepthModelSpec)}") from error
 
 
 def check_sha256(path: Path, want: str) -> None:

@@ -3,18 +3,13 @@
 
 from __future__ import annotations
 
-from typing import Literal, get_args
-
 from cvcdepth_core.errors import ConfigError
+from cvcdepth_core.model_choices import ENCODERS
 from cvcdepth_core.networks.efficientnet_lite import EfficientNetLite0Encoder
 from cvcdepth_core.networks.resnet import RESNET_BLOCKS, ResNetEncoder
 
 Encoder = ResNetEncoder | EfficientNetLite0Encoder
 """Takes images in [0, 1] to feature maps at H/2 ... H/32, finest first, with the widths `channels`."""
-
-EncoderName = Literal["resnet18", "resnet34", "efficientnet_lite0"]
-
-ENCODERS: tuple[str, ...] = get_args(EncoderName)
 
 
 def build_encoder(name: str, in_channels: int = 3) -> Encoder:

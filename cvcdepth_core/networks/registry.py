@@ -16,8 +16,8 @@ from pydantic import (
     model_validator,
 )
 
+from cvcdepth_core.model_choices import ENCODERS
 from cvcdepth_core.networks.depth import INPUT_STRIDE, MIN_INPUT_SIZE, DepthNet
-from cvcdepth_core.networks.encoders import ENCODERS
 from cvcdepth_core.networks.rig_images import DepthNetwork
 
 PER_CAMERA = "per_camera"

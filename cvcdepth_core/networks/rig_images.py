@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from cvcdepth_core.images.rectifier import to_tensor
+from cvcdepth_core.images.surround import to_tensor
 from cvcdepth_core.surround_depth import SurroundPictures
 
 

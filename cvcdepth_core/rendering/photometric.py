@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The photometric error 0.85 SSIM distance + 0.15 absolute difference (method section 6), with its own gradient.
 
-It is evaluated for some fifty views per sample, and left to autograd it costs more time and memory than both networks:
-some thirty intermediate images per view are kept for the backward pass. Here nothing is kept but the two images; the
-backward pass works the statistics out again, a few views at a time so that they stay in the cache.
+The error is evaluated for some fifty views per sample, and left to autograd it costs more time and memory than both
+networks: some thirty intermediate images per view are kept for the backward pass. Here nothing is kept but the two
+images; the backward pass works the statistics out again, a few views at a time so that they stay in the cache.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from torch.autograd.function import once_differentiable
 
 _C1, _C2, _EPSILON = 0.01**2, 0.03**2, 1e-8
 _SSIM_SHARE = 0.85
+_OVER_IMAGE = (-3, -2, -1)
 _CHUNK_ELEMENTS = 1 << 20
 """Pixels times channels that are worked on at a time."""
 
@@ -39,7 +40,12 @@ def photometric_error(prediction: Tensor, target: Tensor) -> Tensor:
 
 def ssim_distance(prediction: Tensor, target: Tensor) -> Tensor:
     """Return clamp((1 - SSIM) / 2, 0, 1) [..., C, H, W] of two such images over 3x3 windows (Wang et al., 2004)."""
-    return ((1 - _Ssim.of(prediction, target).value) / 2).clamp(0, 1)
+    return ((1 - _Ssim.from_images(prediction, target).value) / 2).clamp(0, 1)
+
+
+def masked_mean(error: Tensor, mask: Tensor) -> Tensor:
+    """Return the mean [...] of `error` [..., 1, H, W] weighted by `mask` [..., 1, H, W]; zero for an empty mask."""
+    return (error * mask).sum(_OVER_IMAGE) / (mask.sum(_OVER_IMAGE) + _EPSILON)
 
 
 class _PhotometricError(torch.autograd.Function):
@@ -66,7 +72,7 @@ class _PhotometricError(torch.autograd.Function):
         for chunk in _chunks(predictions):
             prediction, target = predictions[chunk], targets[target_of_view[chunk]]
             grad = grad_error[chunk] / prediction.shape[1]
-            ssim = _Ssim.of(prediction, target)
+            ssim = _Ssim.from_images(prediction, target)
             inside = ssim.value.abs() <= 1  # where the clamp of the distance lets the gradient through
             grad_ssim = torch.where(inside, grad * (-_SSIM_SHARE / 2), torch.zeros_like(grad))
             grad_difference = torch.sign(prediction - target) * (grad * (1 - _SSIM_SHARE))
@@ -97,7 +103,7 @@ class _Ssim:
     value: Tensor
 
     @classmethod
-    def of(cls, x: Tensor, y: Tensor) -> _Ssim:
+    def from_images(cls, x: Tensor, y: Tensor) -> _Ssim:
         mean_x, mean_y = _local_mean(x), _local_mean(y)
         product = mean_x * mean_y
         squares = mean_x.square().add_(mean_y.square())

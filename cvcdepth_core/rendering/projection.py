@@ -83,7 +83,7 @@ def _rotation_log(rotation: Tensor) -> tuple[Tensor, Tensor]:
     return ratio[..., None, None] * skew, ratio.square() * squared_sine
 
 
-def pixel_rays(inverse_intrinsics: Tensor, height: int, width: int) -> Tensor:
+def unit_depth_points(inverse_intrinsics: Tensor, height: int, width: int) -> Tensor:
     """Return the points [..., 3, H*W] at z = 1 m behind every pixel, row by row.
 
     `inverse_intrinsics` [..., 3, 3] belongs to an image of `height` x `width` pixels.
@@ -97,7 +97,7 @@ def pixel_rays(inverse_intrinsics: Tensor, height: int, width: int) -> Tensor:
 def back_project(depth: Tensor, inverse_intrinsics: Tensor) -> Tensor:
     """Return the camera-frame points [..., 3, H*W] in metres of `depth` [..., 1, H, W] (metres along z)."""
     height, width = depth.shape[-2:]
-    return pixel_rays(inverse_intrinsics, height, width) * depth.flatten(-2)
+    return unit_depth_points(inverse_intrinsics, height, width) * depth.flatten(-2)
 
 
 def transform(target_T_source: Tensor, points: Tensor) -> Tensor:

@@ -1,12 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One camera's calibration: the content of a `sensor_msgs/CameraInfo`, validated.
-
-Pixel centres are the integers: pixel (0, 0) spans [-0.5, 0.5]. Scaling an image by s therefore takes the principal
-point c to (c + 0.5) s - 0.5.
-"""
+"""One camera's calibration: the content of a `sensor_msgs/CameraInfo`, validated."""
 
 import math
-import reprlib
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -14,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, model_validator
 
-from cvcdepth_core.errors import RigError
-from cvcdepth_core.images.headers import MAX_PIXELS
+from cvcdepth_core.errors import RigError, first_validation_message
+from cvcdepth_core.rig.pinhole import scale_intrinsics
 
 DistortionModel = Literal["plumb_bob", "rational_polynomial", "equidistant"]
 _COEFFICIENT_COUNTS: dict[str, tuple[int, ...]] = {
@@ -23,6 +18,8 @@ _COEFFICIENT_COUNTS: dict[str, tuple[int, ...]] = {
     "rational_polynomial": (0, 8, 12, 14),
     "equidistant": (0, 4),
 }
+MAX_PIXELS = 50_000_000
+"""Pixels of the largest image that a camera may send; decoding takes up to 16 bytes for each."""
 # Far beyond any lens, and far within what arithmetic holds: a principal point in image sizes, an image size in focal
 # lengths, and a distortion coefficient.
 _MAX_RATIO = 1e4
@@ -128,42 +125,12 @@ class Calibration(BaseModel):
         return scale_intrinsics(sensor_intrinsics, (1 / self.binning_x, 1 / self.binning_y), offset)
 
 
-def scale_intrinsics(
-    intrinsics: NDArray[np.float64], scale: tuple[float, float], offset: tuple[float, float] = (0.0, 0.0)
-) -> NDArray[np.float64]:
-    """Intrinsics [3, 3] of an image first shifted by `offset` pixels (x, y), then scaled by `scale` (x, y).
-
-    Pixel centres stay at integers: c -> (c + offset + 0.5) scale - 0.5.
-    """
-    scaled: NDArray[np.float64] = intrinsics.copy()
-    for row in (0, 1):
-        scaled[row, :2] *= scale[row]
-        scaled[row, 2] = (intrinsics[row, 2] + offset[row] + 0.5) * scale[row] - 0.5
-    return scaled
-
-
 def calibration_from_fields(camera: str, fields: dict[str, object]) -> Calibration:
     """Build a Calibration from the fields of a CameraInfo; RigError names the camera and the first impossible field."""
     try:
         return Calibration.model_validate(fields)
     except ValueError as error:
         raise RigError(f"camera {camera}: camera_info: {first_validation_message(error)}") from error
-
-
-def first_validation_message(error: ValueError) -> str:
-    """One line out of a pydantic ValidationError: the field, what is wrong with it and the value found."""
-    details = getattr(error, "errors", None)
-    if details is None:
-        return str(error)
-    first = details()[0]
-    where = ".".join(str(part) for part in first["loc"])
-    message = str(first["msg"]).removeprefix("Value error, ")
-    if not where:
-        return message
-    # Our own checks say the value themselves, and a missing field has none.
-    says_all = first["type"] in ("missing", "value_error")
-    # The whole of a foreign value may have no end: a few lines of YAML can refer to themselves a billion times.
-    return f"{where}: {message}" if says_all else f"{where}: {message}, found {reprlib.repr(first['input']):.80}"
 
 
 def _first_problem(calibration: Calibration) -> str | None:

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Is the rig as it is described: swapped cameras, the vehicle's own body in view, turned mounts."""
+"""Does the rig match its description: swapped cameras, the vehicle's own body in view, turned mounts, dirty lenses."""

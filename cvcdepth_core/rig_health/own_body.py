@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Find the vehicle's own body in its cameras' pictures: it stands still in the picture while the scene moves.
+"""Finds the vehicle's own body in its cameras' pictures: it stands still in the picture while the scene moves.
 
 For a pixel of the scene below the horizon, the ground bounds the distance from above, so that the vehicle's motion must
 move it by a known number of pixels at least. There the change from one picture to a later one is compared with the
@@ -17,14 +17,15 @@ from numpy.typing import NDArray
 
 from cvcdepth_core.errors import RigError
 from cvcdepth_core.images.decoding import Picture
-from cvcdepth_core.images.rectifier import SurroundPreprocessor, raw_pixels
-from cvcdepth_core.pointcloud import pixel_rays
+from cvcdepth_core.images.rectifier import raw_pixels
+from cvcdepth_core.images.surround import SurroundPreprocessor
+from cvcdepth_core.rig.pinhole import pixel_rays
 from cvcdepth_core.rig.rig import Camera, Rig
 
 MIN_TRAVEL = 0.5
 """Metres that the vehicle moves between the two pictures of a pair, at least."""
 MIN_PAIRS = 8
-"""Pairs of pictures without which nothing is said."""
+"""Pairs of pictures that are needed for a result."""
 
 _WIDTH = 384  # pixels: fine enough for a bumper, coarse enough that a metre of travel moves the near scene by many
 _MIN_SHIFT = 1.0  # pixels that the ground moves within MIN_TRAVEL where a pixel is looked at
@@ -37,7 +38,7 @@ _CLOSING = 15  # pixels: gaps in the outline of the body that are closed
 
 
 class SelfOcclusionFinder:
-    """Collects pairs of surround sets between which the vehicle has moved, and tells body from scene.
+    """Collects pairs of surround sets between which the vehicle has moved, and separates body from scene.
 
     Assumes straight driving forward or backward, which most of a log is, and ground near the base frame's height.
     """
@@ -46,7 +47,7 @@ class SelfOcclusionFinder:
         image_width, image_height = rig.cameras[0].calibration.image_size
         self._rig = rig
         self.preprocessor = SurroundPreprocessor(rig, round(_WIDTH * image_height / image_width), _WIDTH)
-        """Gives the pictures that `add` takes."""
+        """Rectifies the pictures that `add` takes."""
         flows = [
             _ground_flow(camera, K, *self.preprocessor.valid.shape[1:])
             for camera, K in zip(rig.cameras, self.preprocessor.intrinsics, strict=True)
@@ -85,7 +86,7 @@ class SelfOcclusionFinder:
             for sums in (self._changes, self._shift_changes)
         )
         # The stillest picture of the rig shows what the sensors' noise alone changes.
-        noise = min(np.percentile(change[part], _NOISE_PERCENTILE) for change, part in self._looked_at(changes))
+        noise = min(np.percentile(change[part], _NOISE_PERCENTILE) for change, part in self._examined_parts(changes))
         ratios = np.maximum(changes - noise, 0) / np.maximum(textures, 1e-3)
         seeds = self._examined & (textures > _SEED_TEXTURE) & (ratios < _SEED_RATIO)
         grown = self._examined & (ratios < _GROWN_RATIO)
@@ -99,7 +100,7 @@ class SelfOcclusionFinder:
         mask: NDArray[np.uint8] = cv2.remap(grey, pixels, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.where(mask > 127, 255, 0).astype(np.uint8)
 
-    def _looked_at(self, changes: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], NDArray[np.bool_]]]:
+    def _examined_parts(self, changes: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], NDArray[np.bool_]]]:
         return [(change, part) for change, part in zip(changes, self._examined, strict=True) if part.any()]
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Is every camera where the rig says? Neighbours' pictures are rendered from each other, without any depth.
+"""Finds exchanged cameras: neighbours' pictures are rendered from each other, without any depth.
 
 A picture is swept through a neighbour's view on planes of several depths, and every pixel takes the plane that explains
 it best (plane sweep, Collins 1996). Where the rig is right some plane fits almost everywhere; where two cameras are
@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from cvcdepth_core.rendering.photometric import photometric_error
-from cvcdepth_core.rendering.projection import pixel_rays, rigid_inverse, transform
+from cvcdepth_core.rendering.projection import rigid_inverse, transform, unit_depth_points
 from cvcdepth_core.rendering.view_synthesis import align_intensity, sample, sampling_grid
 
 _DEPTHS = (1.5, 2.5, 4.0, 7.0, 14.0, 40.0, 1000.0)  # metres
@@ -45,7 +45,7 @@ class PlacedPictures:
 
 
 class Exchange(NamedTuple):
-    """Two cameras, and how well their pictures fit to those of their neighbours."""
+    """Two cameras, with the photometric errors of their views before and after exchanging them."""
 
     first: int
     second: int
@@ -73,11 +73,11 @@ def best_exchange(placed: PlacedPictures) -> Exchange | None:
     if not known:
         return None
     _, first, second = min(known)
-    as_told = sweep.error(tuple(range(sweep.cameras)), of=(first, second))
+    as_described = sweep.error(tuple(range(sweep.cameras)), of=(first, second))
     exchanged = sweep.error(_exchanged(sweep, first, second), of=(first, second))
-    if as_told is None or exchanged is None:
+    if as_described is None or exchanged is None:
         return None
-    return Exchange(first, second, as_told, exchanged)
+    return Exchange(first, second, as_described, exchanged)
 
 
 def _exchanged(sweep: _Sweep, first: int, second: int) -> tuple[int, ...]:
@@ -86,7 +86,7 @@ def _exchanged(sweep: _Sweep, first: int, second: int) -> tuple[int, ...]:
 
 
 class _Sweep:
-    """Compares any camera in any place with any other in any other, each once."""
+    """Errors of any camera in any place against any other camera in any other place, each computed once."""
 
     def __init__(self, placed: PlacedPictures) -> None:
         self.cameras = len(placed.base_T_camera)
@@ -110,7 +110,7 @@ class _Sweep:
         """Return the error of each set where `camera` in one place sees what `other` sees in its; None: nothing."""
         other_T_view = rigid_inverse(self._poses[other_place]) @ self._poses[place]
         height, width = self._pictures.shape[-2:]
-        rays = pixel_rays(torch.linalg.inv(self._intrinsics[camera]), height, width)
+        rays = unit_depth_points(torch.linalg.inv(self._intrinsics[camera]), height, width)
         points = rays * torch.tensor(_DEPTHS)[:, None, None]
         grid, z = sampling_grid(transform(other_T_view, points), self._intrinsics[other], (height, width))
         ahead = (grid.abs() <= 1).all(dim=-1) & (z.view(grid.shape[:-1]) > 0)  # [D, H, W]
@@ -145,7 +145,7 @@ class _Window(NamedTuple):
 
 
 def _bounding_window(seen: Tensor) -> _Window | None:
-    """Return the rows and columns of `seen` [H, W] that hold all of it; None where that is next to nothing."""
+    """Return the rows and columns of `seen` [H, W] that hold all of it; None where they are fewer than a window."""
     rows, columns = (seen.any(dim=dim).nonzero().flatten() for dim in (1, 0))
     if len(rows) < _WINDOW or len(columns) < _WINDOW:
         return None

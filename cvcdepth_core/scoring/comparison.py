@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Is one result really better than another? Paired bootstrap over the sets that both have; rank correlation."""
+"""Significance of the difference between two results: paired bootstrap over common sets; rank correlation."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ SetValues = dict[tuple[str, int], NDArray[np.float64]]
 """The numbers [N, M] of N cameras by (recording, stamp) of the set; NaN where there is none."""
 
 SETS_TO_PROVE = 6
-"""Sets without which a difference is no proof. Where chance decides, n draws are all better or all worse in 2 / 2^n of
-the cases: 6 % of five draws, 3 % of six."""
+"""Fewest sets from which a difference can be significant. Where chance decides, n draws are all better or all worse in
+2 / 2^n of the cases: 6 % of five draws, 3 % of six."""
 
 _LEAST_SETS = 2
 
@@ -39,14 +39,14 @@ class Difference:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two results compared."""
+    """Comparison of two results."""
 
     differences: dict[str, Difference]
     """By the names of what was compared: `METRIC_NAMES`."""
     sets: int
     """Surround sets that both results have."""
     measured: int
-    """Those among them of which both have any number."""
+    """Sets among them for which both results have a number."""
     only_in_first: int
     only_in_second: int
     level: float
@@ -57,7 +57,7 @@ class Comparison:
 
     @property
     def can_prove(self) -> bool:
-        """Whether there are enough sets for an interval to mean what its level says."""
+        """Whether there are enough sets for the intervals to have their nominal level."""
         return self.measured >= SETS_TO_PROVE
 
 

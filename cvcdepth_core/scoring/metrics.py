@@ -39,10 +39,6 @@ class ErrorSums(NamedTuple):
     delta_3: int
     """... below 1.25^3."""
 
-    def metrics(self) -> dict[str, float]:
-        """Return the numbers of `METRIC_NAMES`; NaN where nothing was predicted."""
-        return dict(zip(METRIC_NAMES, metrics_of(np.array(self, dtype=SUMS)).tolist(), strict=True))
-
 
 _COUNTED = ("truth", "predicted", "delta_1", "delta_2", "delta_3")
 SUMS = np.dtype([(name, "<u4" if name in _COUNTED else "<f8") for name in ErrorSums._fields])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Predictors that look at no picture: what any network must beat."""
+"""Reference predictors that look at no picture; any useful network beats them."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvcdepth_core.errors import ConfigError
-from cvcdepth_core.images.rectifier import SurroundPreprocessor
-from cvcdepth_core.pointcloud import pixel_rays
+from cvcdepth_core.images.surround import SurroundPreprocessor
+from cvcdepth_core.rig.pinhole import pixel_rays
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.surround_depth import SurroundPictures
 
@@ -20,7 +20,7 @@ REFERENCE_HEIGHT, REFERENCE_WIDTH = 384, 640
 
 
 class ReferenceSize(NamedTuple):
-    """The size of the pictures, pixels."""
+    """Size of the pictures in pixels."""
 
     height: int
     width: int

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Depth scores of many images: measured in parts, merged exactly, written to JSON and back without loss.
+"""Depth scores of many images: merged exactly from parts, summarised, written to JSON and back without loss.
 
 Of every image (and every pool of images) there are sums and counts, of which nothing is added up any further. Means are
 taken with `math.fsum`, which rounds once; so a result depends neither on the number of workers nor on their order.
@@ -10,7 +10,6 @@ from __future__ import annotations
 import base64
 import math
 import zlib
-from array import array
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -21,9 +20,10 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from cvcdepth_core.errors import ConfigError
-from cvcdepth_core.scoring.metrics import METRIC_NAMES, SUMS, ErrorSums, Sums, median_ratio, metrics_of, sum_errors
+from cvcdepth_core.files import nan_to_null
+from cvcdepth_core.scoring.metrics import METRIC_NAMES, SUMS, Sums, metrics_of
 
-Protocol = Literal["image", "pool"]
+EvaluationProtocol = Literal["image", "pool"]
 """`image`: every image is one measurement (the field's). `pool`: the pixels of some consecutive images of a camera are,
 and an incomplete last pool is left out (that of the published numbers)."""
 Scaling = Literal["metric", "median"]
@@ -39,7 +39,7 @@ def mean(values: Sequence[float]) -> float:
 
 
 class ScoreSettings(BaseModel):
-    """What is measured; numbers of different settings must not be compared."""
+    """Settings of a measurement; numbers of different settings must not be compared."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
@@ -72,20 +72,9 @@ class ScoreSettings(BaseModel):
         return [ALL, *self.range_names, OVERLAP]
 
 
-class DepthSamples(NamedTuple):
-    """One image's truth and the prediction there."""
-
-    prediction: NDArray[np.float64]
-    """[M] metres, NaN where there is none."""
-    truth: NDArray[np.float64]
-    """[M] metres."""
-    overlap: NDArray[np.bool_]
-    """[M] whether a neighbouring camera sees the point too."""
-
-
 @dataclass(frozen=True, eq=False)
 class Measurements:
-    """What was measured of one recording, in columns: 0.7 kB for an image, or for a pool of images, of a camera."""
+    """Measurements of one recording, in columns: 0.7 kB for an image, or for a pool of images, of a camera."""
 
     recording: str
     cameras: tuple[str, ...]
@@ -110,7 +99,7 @@ class Measurements:
         return self.scales[:, self.cameras.index(camera)] if camera in self.cameras else self.scales[:0, 0]
 
     def to_json(self) -> dict[str, Any]:
-        """Return it with JSON's types: the columns compressed, as the bytes of little-endian numbers."""
+        """Return the content for JSON: the columns compressed, as the bytes of little-endian numbers."""
         columns = b"".join(
             np.ascontiguousarray(column).tobytes() for column in (self.stamps_ns, self.scales, self.sums)
         )
@@ -120,7 +109,7 @@ class Measurements:
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> Measurements:
-        """Undo `to_json`."""
+        """Return what `to_json` was called on."""
         cameras, sets, groups = tuple(content["cameras"]), int(content["sets"]), int(content["groups"])
         shapes: dict[np.dtype[Any], tuple[int, ...]] = {
             np.dtype("<i8"): (sets,),
@@ -146,34 +135,31 @@ class Score(NamedTuple):
     truth: int
     """Truth pixels."""
     measurements: int
-    """Images or pools that the metrics are the mean of."""
+    """Images or pools that the metrics are averaged over."""
 
     def to_json(self) -> dict[str, Any]:
-        """Return it with JSON's types; what is NaN is null."""
-        numbers = self.metrics | {"coverage": self.coverage}
-        return {name: None if math.isnan(number) else number for name, number in numbers.items()} | {
-            "truth_points": self.truth,
-            "measurements": self.measurements,
-        }
+        """Return the content for JSON, NaN as null."""
+        counts = {"truth_points": self.truth, "measurements": self.measurements}
+        return nan_to_null(self.metrics | {"coverage": self.coverage}) | counts
 
 
 class Summary(NamedTuple):
     """The scores by group of pixels."""
 
     cameras: dict[str, dict[str, Score]]
-    """Of each camera: the mean over its measurements."""
+    """Mean over the measurements of each camera."""
     mean: dict[str, Score]
-    """The mean over the cameras that have a value."""
+    """Mean over the cameras that have a value."""
 
     def to_json(self) -> dict[str, Any]:
-        """Return it with JSON's types."""
+        """Return the content for JSON."""
         cameras = {name: _json_by_group(scores) for name, scores in self.cameras.items()}
         return {"mean": _json_by_group(self.mean), "cameras": cameras}
 
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """What was measured of one or many recordings, sorted by their names."""
+    """Measurements of one or many recordings, sorted by their names."""
 
     settings: ScoreSettings
     images: tuple[Measurements, ...]
@@ -200,8 +186,8 @@ class Scores:
         """The cameras' names, in the rig's order."""
         return list(dict.fromkeys(camera for table in self.images if len(table) for camera in table.cameras))
 
-    def summary(self, protocol: Protocol = "image", scaling: Scaling = "metric") -> Summary:
-        """Take the means: per camera over its measurements, then over the cameras."""
+    def summary(self, protocol: EvaluationProtocol = "image", scaling: Scaling = "metric") -> Summary:
+        """Return the means: per camera over its measurements, then over the cameras."""
         tables = self.images if protocol == "image" else self.pools
         cameras = {}
         for camera in self.cameras:
@@ -213,13 +199,13 @@ class Scores:
         mean = {g: _mean_score([scores[g] for scores in cameras.values()]) for g in self.settings.groups}
         return Summary(cameras, mean)
 
-    def scale_ratios(self, protocol: Protocol = "image") -> dict[str, float]:
+    def scale_ratios(self, protocol: EvaluationProtocol = "image") -> dict[str, float]:
         """Return median(truth) / median(prediction) of each camera, the geometric mean; 1 where the scale is right."""
         tables = self.images if protocol == "image" else self.pools
         return {camera: _geometric_mean([table.scales_of(camera) for table in tables]) for camera in self.cameras}
 
     def to_json(self) -> dict[str, Any]:
-        """Return everything with JSON's types."""
+        """Return the content for JSON."""
         return {
             "settings": self.settings.model_dump(mode="json"),
             "images": [table.to_json() for table in self.images],
@@ -228,76 +214,12 @@ class Scores:
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> Scores:
-        """Undo `to_json`. Raises ConfigError when `content` was not written by it."""
+        """Return what `to_json` was called on. Raises ConfigError when `content` was not written by it."""
         try:
             images, pools = (tuple(map(Measurements.from_json, content[key])) for key in ("images", "pools"))
             return cls(ScoreSettings.model_validate(content["settings"]), images, pools)
         except (KeyError, TypeError, ValueError, zlib.error) as error:
             raise ConfigError(f"scores: not what this version writes: {error!r}") from error
-
-
-class SurroundScorer:
-    """Measures the sets of one recording, in order."""
-
-    def __init__(self, recording: str, cameras: Sequence[str], settings: ScoreSettings) -> None:
-        """Name the `recording` as no other recording of the evaluation is named."""
-        self._settings = settings
-        self._cameras = tuple(cameras)
-        self._images, self._pools = (_Columns(recording, self._cameras, len(settings.groups)) for _ in range(2))
-        self._pooled_sets: list[tuple[int, Sequence[DepthSamples]]] = []
-
-    def add(self, stamp_ns: int, samples: Sequence[DepthSamples]) -> int:
-        """Measure one set, `samples` in the order of the cameras; return how many pixels have truth inside the limits.
-
-        Raises ConfigError when there is not one for each camera.
-        """
-        if len(samples) != len(self._cameras):
-            raise ConfigError(f"scores: samples of {len(samples)} cameras, expected {len(self._cameras)}")
-        valid = [_within_limits(image, self._settings) for image in samples]
-        self._images.add(stamp_ns, *self._measure(valid))
-        self._pooled_sets.append((stamp_ns, valid))
-        if len(self._pooled_sets) == self._settings.pool:
-            self._close_pool()
-        return sum(len(image.truth) for image in valid)
-
-    def scores(self) -> Scores:
-        """Return what was measured so far."""
-        return Scores(self._settings, (self._images.table(),), (self._pools.table(),))
-
-    def _close_pool(self) -> None:
-        stamps, sets = zip(*self._pooled_sets, strict=True)
-        joined = [DepthSamples(*map(np.concatenate, zip(*images, strict=True))) for images in zip(*sets, strict=True)]
-        self._pools.add(stamps[0], *self._measure(joined))
-        self._pooled_sets.clear()
-
-    def _measure(self, samples: Sequence[DepthSamples]) -> tuple[list[float], Sums]:
-        """Return the scales [N] and the sums [N, 2, G]."""
-        scales, sums = [], []
-        for image in samples:
-            scale = median_ratio(image.prediction, image.truth)
-            scaled = image._replace(prediction=_clamp(image.prediction * scale, self._settings))
-            scales.append(scale)
-            sums.append([_sums_by_group(found, self._settings) for found in (image, scaled)])
-        return scales, np.array(sums, dtype=SUMS)
-
-
-class _Columns:
-    """The columns of `Measurements` while they grow."""
-
-    def __init__(self, recording: str, cameras: tuple[str, ...], groups: int) -> None:
-        self._recording, self._cameras, self._groups = recording, cameras, groups
-        self._stamps, self._scales, self._sums = array("q"), array("d"), bytearray()
-
-    def add(self, stamp_ns: int, scales: Sequence[float], sums: Sums) -> None:
-        self._stamps.append(stamp_ns)
-        self._scales.extend(scales)
-        self._sums += sums.tobytes()
-
-    def table(self) -> Measurements:
-        cameras = len(self._cameras)
-        sums = np.frombuffer(bytes(self._sums), SUMS).reshape(-1, cameras, len(SCALINGS), self._groups)
-        scales = np.array(self._scales, dtype=np.float64).reshape(-1, cameras)
-        return Measurements(self._recording, self._cameras, np.array(self._stamps, dtype=np.int64), scales, sums)
 
 
 def _by_recording(tables: Iterable[Measurements]) -> tuple[Measurements, ...]:
@@ -306,26 +228,6 @@ def _by_recording(tables: Iterable[Measurements]) -> tuple[Measurements, ...]:
         if one.recording == following.recording:
             raise ConfigError(f"scores: {one.recording} was measured twice")
     return ordered
-
-
-def _within_limits(image: DepthSamples, settings: ScoreSettings) -> DepthSamples:
-    """Keep the truth inside the limits; a prediction of 0 or less is none, like NaN."""
-    kept = (image.truth > settings.min_depth) & (image.truth < settings.max_depth)
-    prediction = np.where(image.prediction > 0, image.prediction, np.nan)[kept]
-    return DepthSamples(_clamp(prediction, settings), image.truth[kept], image.overlap[kept])
-
-
-def _clamp(prediction: NDArray[np.float64], settings: ScoreSettings) -> NDArray[np.float64]:
-    clamped: NDArray[np.float64] = np.clip(prediction, settings.min_depth, settings.max_depth)
-    return clamped
-
-
-def _sums_by_group(image: DepthSamples, settings: ScoreSettings) -> list[ErrorSums]:
-    """Add up the errors of every group."""
-    bins = np.digitize(image.truth, settings.range_edges)
-    ranges = [bins == i for i, _ in enumerate(settings.range_names, start=1)]
-    masks = [np.ones(len(image.truth), dtype=bool), *ranges, image.overlap]
-    return [sum_errors(image.prediction[mask], image.truth[mask]) for mask in masks]
 
 
 def _camera_score(sums: Sums) -> Score:

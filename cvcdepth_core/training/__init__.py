@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The objective and the trainer."""
+"""Training: configuration, objective, trainer, and what a run keeps in its folder."""

@@ -10,13 +10,13 @@ from typing import Any, Literal
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from cvcdepth_core.errors import ConfigError
-from cvcdepth_core.networks import EncoderName
+from cvcdepth_core.errors import ConfigError, validation_messages
+from cvcdepth_core.files import load_yaml
+from cvcdepth_core.model_choices import EncoderName
 from cvcdepth_core.networks.registry import DepthModelSpec
 from cvcdepth_core.training.augmentation import ColorJitterConfig, FlipMode
 from cvcdepth_core.training.model import PoseMethod
 from cvcdepth_core.training.objective import ObjectiveConfig
-from cvcdepth_core.yaml_text import load_yaml
 
 ExposureMotion = Literal["auto", "recorded", "network", "none"]
 
@@ -33,11 +33,11 @@ class PoseConfig(_Section):
     encoder: EncoderName = "resnet18"
     """Backbone."""
     method: PoseMethod = "front"
-    """Whose motion is predicted from which images; see `SurroundModel`."""
+    """Which motion is predicted from which images; see `SurroundModel`."""
 
 
 class AugmentationConfig(_Section):
-    """What the networks see differently from the losses."""
+    """Changes to the images that the networks see; the losses compare the unchanged ones."""
 
     color_jitter: ColorJitterConfig = ColorJitterConfig()
     """Random colour changes, per camera."""
@@ -58,7 +58,7 @@ class RecordingsConfig(_Section):
     max_interval: float = Field(default=0.5, gt=0, allow_inf_nan=False)
     """Seconds from a target to a context frame, at most: a longer gap of the recording is not bridged."""
     exposure_motion: ExposureMotion = "auto"
-    """How the vehicle moved between the exposures of one set, which tells where each camera was when it fired:
+    """How the vehicle moved between the exposures of one set, which gives the place of each camera when it fired:
     `recorded` (odometry or /tf), `network` (as the pose network says, at constant velocity between two sets), `auto`
     (recorded where there is some, else of the network), or `none`, as in the published method, which takes the
     exposures as simultaneous. `true` is `auto`, `false` is `none`."""
@@ -76,16 +76,16 @@ class RecordingsConfig(_Section):
 
 
 class OptimizerConfig(_Section):
-    """Adam, its schedule, and what keeps a step from doing harm."""
+    """Adam, its learning-rate schedule, and limits on a step."""
 
     learning_rate: float = Field(default=1e-4, gt=0)
-    """At the start."""
+    """Initial learning rate."""
     betas: tuple[float, float] = (0.9, 0.999)
     """Decay of Adam's two moments."""
     epochs: int = Field(default=20, ge=1)
-    """Passes over the training samples."""
+    """Number of passes over the training samples."""
     decay_after_epochs: int = Field(default=15, ge=1)
-    """The learning rate is multiplied by `decay_factor` after every so many epochs."""
+    """Epochs after each of which the learning rate is multiplied by `decay_factor`."""
     decay_factor: float = Field(default=0.1, gt=0, le=1)
     """See `decay_after_epochs`."""
     weight_decay: float = Field(default=0.0, ge=0)
@@ -114,7 +114,7 @@ class OptimizerConfig(_Section):
 
 
 class EvaluationConfig(_Section):
-    """How predictions are scored."""
+    """Scoring of predictions during the run."""
 
     max_depth: float = Field(default=200.0, gt=0, le=1e4)
     """Metres; ground truth at or beyond it is left out, predictions are clamped to it."""
@@ -125,7 +125,7 @@ class EvaluationConfig(_Section):
 
 
 class TrainingConfig(_Section):
-    """Everything that decides what a training run computes."""
+    """Everything that determines a training run."""
 
     dataset: Literal["ddad", "nuscenes", "recording"] = "ddad"
     """Where samples come from."""
@@ -136,21 +136,21 @@ class TrainingConfig(_Section):
     objective: ObjectiveConfig = ObjectiveConfig()
     """Weights and variants of the loss."""
     augmentation: AugmentationConfig = AugmentationConfig()
-    """What the networks see differently from the losses."""
+    """Changes to the images that the networks see; the losses compare the unchanged ones."""
     recordings: RecordingsConfig = RecordingsConfig()
-    """For `dataset: recording`: which moments become samples."""
+    """For `dataset: recording`: which moments become samples, and how they are read."""
     optimizer: OptimizerConfig = OptimizerConfig()
-    """Adam, its schedule, and what keeps a step from doing harm."""
+    """Adam, its learning-rate schedule, and limits on a step."""
     evaluation: EvaluationConfig = EvaluationConfig()
-    """How predictions are scored."""
+    """Scoring of predictions during the run."""
     validate_every: int = Field(default=1, ge=1)
     """Epochs between two validations; the last epoch is always validated."""
     checkpoint_every: int = Field(default=200, ge=1)
     """Steps between two checkpoints; there is one at the end of every epoch too."""
     pictures_every: int = Field(default=200, ge=1)
-    """Steps between two sets of pictures for those who watch the run, from the first step on."""
+    """Steps between two sets of pictures for the run's observers, from the first step on."""
     seed: int = Field(default=42, ge=0)
-    """Of every random draw; how many processes share a step does not change the draws."""
+    """Seed of all random draws, which do not depend on the number of processes."""
 
     @model_validator(mode="after")
     def _pose_consistency_has_poses_to_compare(self) -> TrainingConfig:
@@ -171,9 +171,7 @@ def load_training_config(path: str | Path) -> TrainingConfig:
     try:
         return TrainingConfig.model_validate(_read_with_bases(path, above=()))
     except ValidationError as error:
-        raise ConfigError(
-            f"{path}: {'; '.join(_describe(item) for item in error.errors(include_url=False))}"
-        ) from error
+        raise ConfigError(f"{path}: {validation_messages(error, TrainingConfig)}") from error
 
 
 def _read_with_bases(path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
@@ -204,21 +202,3 @@ def _overlay(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, A
         below = merged.get(key)
         merged[key] = _overlay(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
     return merged
-
-
-def _describe(item: Mapping[str, Any]) -> str:
-    name = ".".join(map(str, item["loc"]))
-    if item["type"] == "extra_forbidden":
-        return f"{name} is no known field; {_known_fields(item['loc'])}"
-    if item["type"] == "missing":
-        return f"{name} is missing"
-    if not name:
-        return str(item["msg"])
-    return f"{name} is {item['input']!r}: {item['msg']}"
-
-
-def _known_fields(location: tuple[str | int, ...]) -> str:
-    section: Any = TrainingConfig
-    for part in location[:-1]:
-        section = section.model_fields[part].annotation
-    return f"expected one of {', '.join(section.model_fields)}"

@@ -27,7 +27,7 @@ _PATIENCE = timedelta(hours=12)
 
 @dataclass(frozen=True)
 class Processes:
-    """The processes that compute a run together; by default, this one alone."""
+    """The processes that compute a run together; by default this single one."""
 
     rank: int = 0
     """This process's number; only the first, 0, writes and reports."""
@@ -39,23 +39,23 @@ class Processes:
         """Whether this process writes and reports."""
         return self.rank == 0
 
-    def add_up(self, values: Tensor) -> Tensor:
+    def sum_over_processes(self, values: Tensor) -> Tensor:
         """Replace `values`, of the same shape in every process, by their sum over the processes; returns them."""
         if self.count > 1:
             distributed.all_reduce(values)
         return values
 
-    def add_up_gradients(self, parameters: Sequence[nn.Parameter]) -> None:
-        """Replace the gradients by their sums over the processes, all in one message."""
+    def sum_gradients_over_processes(self, parameters: Sequence[nn.Parameter]) -> None:
+        """Replace the gradients by their sums over the processes, in one message."""
         gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
         if self.count == 1 or not gradients:
             return
-        sums = self.add_up(torch.cat([gradient.flatten() for gradient in gradients]))
+        sums = self.sum_over_processes(torch.cat([gradient.flatten() for gradient in gradients]))
         parts = torch.split_with_sizes(sums, [gradient.numel() for gradient in gradients])
         for gradient, part in zip(gradients, parts, strict=True):
             gradient.copy_(part.view_as(gradient))
 
-    def told_by_first(self, content: bytes) -> bytes:
+    def broadcast_from_first(self, content: bytes) -> bytes:
         """Return the first process's `content` in every process, which waits for it."""
         contents = [content]
         if self.count > 1:
@@ -63,25 +63,25 @@ class Processes:
         return contents[0]
 
     @contextmanager
-    def first_goes_ahead(self) -> Iterator[None]:
-        """Let the others begin the block when the first is through with it: it leaves there what they find."""
+    def first_process_first(self) -> Iterator[None]:
+        """Run the block in the first process before it begins in the others, which find what the first has written."""
         if not self.is_first:
-            self.told_by_first(b"")
+            self.broadcast_from_first(b"")
         yield
         if self.is_first:
-            self.told_by_first(b"")
+            self.broadcast_from_first(b"")
 
 
-ALONE = Processes()
+SINGLE_PROCESS = Processes()
 """This process, without others."""
 
 
 @contextmanager
 def launched_processes() -> Iterator[Processes]:
-    """Join the other processes that torchrun started; without torchrun, or with one process, this one is alone."""
+    """Join the other processes that torchrun started; without torchrun, or with one process, there is only this one."""
     count = int(os.environ["WORLD_SIZE"]) if distributed.is_torchelastic_launched() else 1
     if count == 1:
-        yield ALONE
+        yield SINGLE_PROCESS
         return
     distributed.init_process_group(timeout=_PATIENCE)
     yield Processes(distributed.get_rank(), count)
@@ -114,7 +114,7 @@ def share_batch_statistics(network: nn.Module, device: torch.device) -> nn.Modul
 
 
 class _SharedBatchNorm(nn.BatchNorm2d):
-    """What torch's SyncBatchNorm computes, for CPUs, which that does not support."""
+    """Batch normalisation over all processes on CPUs, which torch's SyncBatchNorm does not support."""
 
     momentum: float
     running_mean: Tensor
@@ -127,9 +127,9 @@ class _SharedBatchNorm(nn.BatchNorm2d):
         values = images.to(self.weight.dtype)
         count = values.new_full((1,), values.numel() / values.shape[1])
         distributed.all_reduce(count)
-        mean = _add_up(values.sum((0, 2, 3))) / count
+        mean = _sum_over_processes(values.sum((0, 2, 3))) / count
         centred = values - mean[:, None, None]
-        variance = _add_up(centred.square().sum((0, 2, 3))) / count
+        variance = _sum_over_processes(centred.square().sum((0, 2, 3))) / count
         with torch.no_grad():
             self.num_batches_tracked += 1
             self.running_mean.lerp_(mean, self.momentum)
@@ -138,7 +138,7 @@ class _SharedBatchNorm(nn.BatchNorm2d):
         return (centred * scale[:, None, None] + self.bias[:, None, None]).to(images.dtype)
 
 
-def _add_up(values: Tensor) -> Tensor:
+def _sum_over_processes(values: Tensor) -> Tensor:
     total: Tensor = _Sum.apply(values)  # type: ignore[no-untyped-call]
     return total
 

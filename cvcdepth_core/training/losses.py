@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The loss terms of method section 6, one free function each; the photometric error is in `photometric`.
+"""The loss terms of method section 6, one free function each; the photometric one is in `rendering.photometric`.
 
 Images are [..., C, H, W] with any leading dimensions (samples, frames, cameras), which every reduction keeps: no term
 mixes samples or cameras.
@@ -16,11 +16,6 @@ _EPSILON = 1e-8
 _EULER_WEIGHT = 10.0
 
 _OVER_IMAGE = (-3, -2, -1)
-
-
-def masked_mean(error: Tensor, mask: Tensor) -> Tensor:
-    """Return the mean [...] of `error` [..., 1, H, W] weighted by `mask` [..., 1, H, W]; zero for an empty mask."""
-    return (error * mask).sum(_OVER_IMAGE) / (mask.sum(_OVER_IMAGE) + _EPSILON)
 
 
 def auto_mask(reprojection_error: Tensor, identity_error: Tensor) -> Tensor:

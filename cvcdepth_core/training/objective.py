@@ -14,11 +14,11 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
-from cvcdepth_core.rendering.photometric import photometric_error
+from cvcdepth_core.rendering.photometric import masked_mean, photometric_error
 from cvcdepth_core.rendering.projection import back_project, rigid_inverse, transform
 from cvcdepth_core.rendering.view_synthesis import Warp, align_intensity, sample, splat_depth, sum_by_target, warp_views
 from cvcdepth_core.training.batch import RigBatch
-from cvcdepth_core.training.losses import auto_mask, masked_mean, pose_consistency, smoothness
+from cvcdepth_core.training.losses import auto_mask, pose_consistency, smoothness
 from cvcdepth_core.training.motion import motions_seen_from_anchor, relative_poses
 
 _IDENTITY_NOISE = 1e-5
@@ -50,7 +50,7 @@ class ObjectiveConfig(BaseModel):
 
 @dataclass(frozen=True)
 class Prediction:
-    """What the networks say about a `RigBatch`, mirrored back if they saw it mirrored."""
+    """Output of the networks for a `RigBatch`, mirrored back if they saw it mirrored."""
 
     disparity: Tensor
     """[B, N, 1, H, W] in (0, 1)."""
@@ -60,13 +60,13 @@ class Prediction:
     """[B, F, N, 4, 4] pose `context_T_target` of each camera for each context frame."""
 
     def first_sample(self) -> Prediction:
-        """Return what is said about the first sample, without its gradient."""
+        """Return the output for the first sample, without its gradient."""
         return Prediction(*(part[:1].detach() for part in (self.disparity, self.depth, self.motions)))
 
 
 @dataclass(frozen=True)
 class Overlap:
-    """Views of every camera put together from its neighbours."""
+    """Views of every camera rendered from its neighbours' images."""
 
     images: Tensor
     """[B, 1 + F, N, 3, H, W], intensity aligned; frame 0 is spatial, the others spatio-temporal."""
@@ -78,7 +78,7 @@ class Overlap:
 
 @dataclass(frozen=True)
 class Views:
-    """Everything that is rendered for one step."""
+    """All views that are rendered for one step."""
 
     temporal: Tensor
     """[B, F, N, 3, H, W] each camera rendered from its own context frames, intensity aligned."""
@@ -217,11 +217,11 @@ def masked_errors(
     """
     target, overlap = batch.images[:, None], views.overlap
     reprojection = photometric_error(views.temporal, target).amin(dim=1)
-    moved = auto_mask(reprojection, _identity_error(batch, identity_noise)) * batch.masks
+    auto_masks = auto_mask(reprojection, _identity_error(batch, identity_noise)) * batch.masks
     spatial_mask = batch.masks * overlap.masks[:, 0]
-    st_masks = batch.masks[:, None] * overlap.masks[:, 1:] * moved[:, None]
+    st_masks = batch.masks[:, None] * overlap.masks[:, 1:] * auto_masks[:, None]
     spatial, spatio_temporal = overlap.images[:, :1], overlap.images[:, 1:]
-    errors = {"temporal": (reprojection, moved)}
+    errors = {"temporal": (reprojection, auto_masks)}
     if config.spatial > 0:
         errors["spatial"] = (photometric_error(spatial, target).squeeze(1), spatial_mask)
     if config.spatio_temporal > 0:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A training run's folder: checkpoint, state to resume from, log and configuration, whatever moment it is killed at."""
+"""The folder of a training run: checkpoint, state, log and configuration, consistent whenever the run is killed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import torch
 import yaml
 from pydantic import ValidationError
 
-from cvcdepth_core.errors import CheckpointError, OutputError
+from cvcdepth_core.errors import CheckpointError, OutputError, validation_messages
 from cvcdepth_core.files import write_atomically
 from cvcdepth_core.training.config import TrainingConfig
 
@@ -24,7 +24,7 @@ _STATE_FILE, _CONFIG_FILE = "state.pt", "config.yaml"
 
 
 class RunFolder:
-    """The files of one run. Whoever writes raises OutputError, naming the file, where the disk does not take it."""
+    """The files of one run. Writing raises OutputError, naming the file, when it fails."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -32,29 +32,29 @@ class RunFolder:
         self.state = path / _STATE_FILE
 
     def create(self) -> None:
-        """Make the folder, if it is not there."""
+        """Create the folder unless it exists."""
         self._path.mkdir(parents=True, exist_ok=True)
 
     def write_config(self, config: TrainingConfig) -> None:
-        """Keep the configuration beside what it makes."""
+        """Write the configuration beside the results."""
         text = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
         write_atomically(self._path / _CONFIG_FILE, text.encode())
 
     def write_state(self, state: Mapping[str, Any]) -> None:
-        """Write what resuming needs, in the place of what was there."""
+        """Write the state that a run is resumed from, replacing the former one."""
         content = io.BytesIO()
         torch.save(dict(state), content)
         write_atomically(self.state, content.getvalue())
 
     def read_state(self) -> bytes:
-        """Return the bytes of what `write_state` wrote last, or none; CheckpointError when the file is empty."""
+        """Return the state's bytes, empty without a state; CheckpointError when the file is empty."""
         content = self.state.read_bytes() if self.state.exists() else None
         if content == b"":
             raise CheckpointError(f"{self.state}: is empty (0 bytes); remove it to start the run anew")
         return content or b""
 
     def state_from(self, content: bytes) -> dict[str, Any]:
-        """Return what `write_state` was given, on the CPU, from what `read_state` gave; CheckpointError for damage."""
+        """Return the state, on the CPU, from the bytes of `read_state`; CheckpointError when they are damaged."""
         try:
             return dict(torch.load(io.BytesIO(content), map_location="cpu", weights_only=True))
         except (RuntimeError, pickle.UnpicklingError, EOFError, KeyError, TypeError, ValueError) as error:
@@ -62,7 +62,7 @@ class RunFolder:
             raise CheckpointError(f"{self.state}: is damaged ({reason}); remove it to start the run anew") from error
 
     def append_to_log(self, entry: Mapping[str, Any]) -> None:
-        """Add a line to the log."""
+        """Append one line of JSON to the log."""
         path = self._path / LOG_FILE
         try:
             with path.open("a", encoding="utf-8") as file:
@@ -71,7 +71,7 @@ class RunFolder:
             raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
 
     def drop_remains(self, step: int, validations: Sequence[Mapping[str, Any]]) -> None:
-        """Drop what a killed run left that its state, at `step` and after these validations, knows nothing of."""
+        """Remove what a killed run wrote after its state: later log lines, other validations, unfinished files."""
         for unfinished in self._path.glob(".*.tmp"):
             unfinished.unlink()
         path = self._path / LOG_FILE
@@ -91,15 +91,15 @@ class RunFolder:
 
 @dataclass(frozen=True)
 class RunIdentity:
-    """What decides the weights after a step: a run is only resumed by one that has the same."""
+    """Everything that determines the weights after a step; a run is only resumed with the same."""
 
     config: TrainingConfig
     samples: int
-    """Of one epoch, of all processes together."""
+    """Number of samples of one epoch, of all processes together."""
     samples_together: int
     """Samples that go through the networks of all processes together."""
     inputs: Mapping[str, str] = field(default_factory=dict)
-    """What it is made from, by what each is called: the start, and what `samples` alone does not tell of the data."""
+    """Identity of each input by its name: the starting weights, and the data beyond the number of samples."""
 
     def to_state(self) -> dict[str, Any]:
         """Return what `refuse_other` compares, for the run's state."""
@@ -138,21 +138,21 @@ class RunIdentity:
             if were.get(name) != self.inputs.get(name)
         ]
         if differences:
-            told = "; ".join(differences)
-            raise CheckpointError(f"{path}: was made from something else: {told}; choose another folder")
+            listed = "; ".join(differences)
+            raise CheckpointError(f"{path}: was made from something else: {listed}; choose another folder")
 
 
 def _configuration(path: Path, state: Mapping[str, Any]) -> TrainingConfig:
-    """Return the configuration of the run that `state` is of; fields that are newer than it have their defaults."""
+    """Return the configuration of the run that wrote `state`; fields that it did not know have their defaults."""
     try:
         return TrainingConfig.model_validate_json(state["config"])
     except ValidationError as error:
-        reason = " ".join(str(error).split())
+        reason = validation_messages(error, TrainingConfig)
         raise CheckpointError(f"{path}: its configuration is not one of this version: {reason}") from error
 
 
 def _what_is_computed(config: TrainingConfig) -> dict[str, Any]:
-    """Return the fields that decide the weights after a step, not how many there are or what is told of them."""
+    """Return the fields that determine the weights after a step, without the number of steps and the reporting."""
     return config.model_dump(
         exclude={
             "optimizer": {"epochs", "samples_per_batch"},

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The training loop: plain torch, one process or several, to be killed and resumed at any moment.
+"""The training loop: plain torch, one process or several; a run can be killed and resumed at any moment.
 
 Every sample's random draws come from a generator seeded by the configuration's seed, the step's number and the sample's
 place in the step, and the batches of an epoch from seed and epoch. So a resumed run computes exactly what an
@@ -30,7 +30,7 @@ from cvcdepth_core.networks.checkpoint import save_checkpoint
 from cvcdepth_core.training.augmentation import draw_flips, jitter_colors
 from cvcdepth_core.training.batch import RigBatch
 from cvcdepth_core.training.config import AugmentationConfig, TrainingConfig
-from cvcdepth_core.training.distributed import ALONE, Processes, share_batch_statistics
+from cvcdepth_core.training.distributed import SINGLE_PROCESS, Processes, share_batch_statistics
 from cvcdepth_core.training.model import SurroundModel
 from cvcdepth_core.training.objective import ObjectiveValue, Prediction, evaluate_objective
 from cvcdepth_core.training.run_folder import RunFolder, RunIdentity
@@ -40,33 +40,33 @@ _MAX_SKIPPED_IN_A_ROW = 20
 
 @dataclass(frozen=True)
 class ValidationOutcome:
-    """What a validation found."""
+    """Result of a validation."""
 
     scores: Mapping[str, float]
-    """They go to the log."""
+    """Numbers by name, written to the log."""
     stop: bool = False
     """Whether the run ends here, before its configured epochs (early stopping)."""
 
 
 Validation = Callable[["Trainer"], ValidationOutcome]
-"""Scores the trainer's `result`, then in evaluation mode; its `validations` tell what was found before."""
+"""Scores the trainer's `result`, which is in evaluation mode then; `validations` holds the former results."""
 
 
 class RunObserver(Protocol):
-    """Is told what a run does while it does it; what it takes long for, the run waits for."""
+    """Observer of a run. Its methods are called from the training loop, which waits for them."""
 
     def on_step(self, trainer: Trainer, entry: Mapping[str, Any]) -> None:
-        """Take what was logged of a step."""
+        """Take the log entry of a step."""
 
     def on_pictures(self, trainer: Trainer, batch: RigBatch, prediction: Prediction) -> None:
-        """Take the first sample of a step and what the networks said of it, every `pictures_every` steps."""
+        """Take the first sample of a step and its prediction, every `pictures_every` steps."""
 
     def on_validation(self, trainer: Trainer, entry: Mapping[str, Any]) -> None:
-        """Take what was logged of a validation."""
+        """Take the log entry of a validation."""
 
 
 class Batches(Protocol):
-    """Where a process's training batches come from; their order must depend on the epoch's number only.
+    """Source of one process's training batches; their order must depend on the epoch's number only.
 
     Several processes take the parts of the same batches: sample i of process r's part is sample i * count + r of the
     whole, and all have as many batches.
@@ -77,21 +77,21 @@ class Batches(Protocol):
         """Samples of one epoch, of all processes together."""
 
     def epoch(self, number: int, first: int = 0) -> Iterator[RigBatch | None]:
-        """Give the batches of an epoch from the `first` on; None for one that could not be read."""
+        """Yield the batches of an epoch from number `first` on; None for one that could not be read."""
 
 
 @dataclass
 class Progress:
-    """How far a run is."""
+    """Progress of a run."""
 
     epoch: int = 0
-    """Epochs that are complete."""
+    """Completed epochs."""
     batch: int = 0
-    """Batches that are done of the epoch in work."""
+    """Completed batches of the current epoch."""
     step: int = 0
-    """Optimiser steps, skipped ones too."""
+    """Optimiser steps, including skipped ones."""
     skipped: int = 0
-    """Steps that were left out since their loss or gradient was not finite."""
+    """Steps skipped because loss or gradient was not finite."""
     unreadable: int = 0
     """Batches none of whose samples could be read."""
     stopped: bool = False
@@ -99,7 +99,7 @@ class Progress:
 
 
 class Trainer:
-    """Trains a model on batches into a run folder, from where the folder's last checkpoint stands."""
+    """Trains a model on batches into a run folder; resumes from the folder's last state."""
 
     def __init__(
         self,
@@ -111,12 +111,12 @@ class Trainer:
         validate: Validation | None = None,
         metadata: Mapping[str, str] | None = None,
         observers: Sequence[RunObserver] = (),
-        processes: Processes = ALONE,
+        processes: Processes = SINGLE_PROCESS,
         inputs: Mapping[str, str] | None = None,
     ) -> None:
-        """`metadata` travels in the checkpoints. Of several `processes`, the first alone validates, writes and tells.
+        """`metadata` is stored in the checkpoints. Of several `processes`, only the first validates and writes.
 
-        `inputs` name what the run is made from beside its configuration; it is resumed with the same only.
+        `inputs` identify what a run depends on beside its configuration; it is resumed only with the same ones.
         Raises CheckpointError when the folder holds another run, ConfigError when the processes cannot share a step,
         TrainingError when they have not found the same samples.
         """
@@ -125,7 +125,7 @@ class Trainer:
         self.config = config
         self.progress = Progress()
         self.validations: list[dict[str, Any]] = []
-        """What was logged of every validation."""
+        """Log entries of all validations."""
         self._device = torch.device(device)
         self.model = _prepared(model, self._device, processes)
         self._batches = batches
@@ -133,7 +133,9 @@ class Trainer:
         self._validate = validate
         self._observers = tuple(observers) if processes.is_first else ()
         self._metadata = dict(metadata or {})
-        self._inputs: dict[str, str] = json.loads(processes.told_by_first(json.dumps(dict(inputs or {})).encode()))
+        self._inputs: dict[str, str] = json.loads(
+            processes.broadcast_from_first(json.dumps(dict(inputs or {})).encode())
+        )
         self._folder = RunFolder(run_directory)
         self._optimizer = torch.optim.AdamW(
             self.model.parameters(),
@@ -175,7 +177,7 @@ class Trainer:
                 self.save()
 
     def save(self) -> None:
-        """Write what resuming needs, then the checkpoint; each appears complete or not at all."""
+        """Write the state to resume from, then the checkpoint; each appears complete or not at all."""
         if not self._processes.is_first:
             return
         self._folder.write_state(
@@ -211,12 +213,12 @@ class Trainer:
 
     @property
     def _samples_done(self) -> int:
-        """Samples of this and the former epochs that steps were made of."""
+        """Samples of this and the former epochs that went into steps."""
         samples = self._batches.samples
         return self.progress.epoch * samples + min(self.progress.batch * self._samples_together, samples)
 
     def _resume(self) -> None:
-        content = self._processes.told_by_first(self._folder.read_state() if self._processes.is_first else b"")
+        content = self._processes.broadcast_from_first(self._folder.read_state() if self._processes.is_first else b"")
         if content:
             state = self._folder.state_from(content)
             self._identity.refuse_other(state, self._folder.state)
@@ -255,7 +257,7 @@ class Trainer:
         self.progress.batch = 0
 
     def _step(self, batches: Sequence[RigBatch | None]) -> dict[str, Any]:
-        """Make one optimiser step of several batches; return what is logged of it."""
+        """Make one optimiser step of several batches; return its log entry."""
         self.progress.step += 1
         readable = self._readable_by_all(batches)
         self.progress.unreadable += len(batches) - len(readable)
@@ -281,7 +283,7 @@ class Trainer:
         The processes have to go through the networks as often, or they would wait for each other's statistics for ever.
         """
         missing = torch.tensor([float(batch is None) for batch in batches], device=self._device)
-        somewhere = self._processes.add_up(missing).tolist()
+        somewhere = self._processes.sum_over_processes(missing).tolist()
         return {place: batch for place, batch in enumerate(batches) if batch is not None and not somewhere[place]}
 
     def _backpropagate(self, batch: RigBatch, place: int) -> ObjectiveValue:
@@ -309,13 +311,13 @@ class Trainer:
         columns |= {name: [value.terms[name].flatten() for value in values] for name in values[0].terms}
         joined = [torch.cat(column).double() for column in columns.values()]
         sums = torch.stack([torch.stack([column.sum(), torch.ones_like(column).sum()]) for column in joined])
-        totals, counts = self._processes.add_up(sums).unbind(1)
+        totals, counts = self._processes.sum_over_processes(sums).unbind(1)
         means = dict(zip(columns, (totals / counts).tolist(), strict=True))
         return int(counts[0]), means.pop(""), means
 
     def _mean_gradient_norm(self, samples: int) -> float:
         """Turn the gradients' sum into the mean of all processes and shorten it if configured; return its length."""
-        self._processes.add_up_gradients(list(self.model.parameters()))
+        self._processes.sum_gradients_over_processes(list(self.model.parameters()))
         for parameter in self.model.parameters():
             if parameter.grad is not None:
                 parameter.grad /= max(samples, 1)
@@ -341,7 +343,7 @@ class Trainer:
         if self._validate is None:
             return
         scores = self._scores(self._validate) if self._processes.is_first else b""
-        entry = json.loads(self._processes.told_by_first(scores))
+        entry = json.loads(self._processes.broadcast_from_first(scores))
         self.progress.stopped = entry["stop"]
         self.validations.append(entry)
         self._log(entry)
@@ -349,7 +351,7 @@ class Trainer:
             observer.on_validation(self, entry)
 
     def _scores(self, validate: Validation) -> bytes:
-        """Validate; return what is logged of it, as JSON."""
+        """Validate; return the log entry as JSON."""
         was_training = self.result.training
         self.result.eval()
         with torch.inference_mode():
@@ -379,7 +381,7 @@ def _refuse_uneven_shares(config: TrainingConfig, processes: Processes) -> None:
 
 
 def _refuse_different_samples(samples: int, processes: Processes) -> None:
-    first = int(processes.told_by_first(str(samples).encode()))
+    first = int(processes.broadcast_from_first(str(samples).encode()))
     if samples != first:
         raise TrainingError(
             f"process {processes.rank} has {samples} samples, the first has {first}: the machines do not have the same "
@@ -388,7 +390,7 @@ def _refuse_different_samples(samples: int, processes: Processes) -> None:
 
 
 def _compile(model: SurroundModel) -> None:
-    """Have torch translate the networks, not the objective, which is many small steps on small tensors."""
+    """Have torch translate the networks, not the objective, which is many small operations."""
     compiler = os.environ.get("CXX", "g++")
     if shutil.which(compiler) is None:
         raise ConfigError(

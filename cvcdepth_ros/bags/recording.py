@@ -13,7 +13,7 @@ from rosbags.serde import SerdeError
 from rosbags.typesys.store import Typestore
 
 from cvcdepth_core.errors import RecordingError
-from cvcdepth_core.yaml_text import load_yaml
+from cvcdepth_core.files import load_yaml
 from cvcdepth_ros.bags import mcap_file, ros1_file, sqlite_file
 from cvcdepth_ros.bags.mcap_file import McapFile, unpack_zstd
 from cvcdepth_ros.bags.ordering import Source, in_time_order

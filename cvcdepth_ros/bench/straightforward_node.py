@@ -20,7 +20,7 @@ from rclpy.node import Node
 
 from cvcdepth_core.errors import CvcDepthError
 from cvcdepth_core.estimator import SurroundDepthEstimator
-from cvcdepth_core.rig.rig import load_rig_layout
+from cvcdepth_core.rig.rig_file import load_rig_layout
 from cvcdepth_ros.bench.straightforward import straightforward_cloud
 from cvcdepth_ros.live.mailbox import MailboxStatistics
 from cvcdepth_ros.live.process_setup import prepare_process

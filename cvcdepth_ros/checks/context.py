@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from cvcdepth_core.errors import ImageError, RecordingError, RigError, TransformError
 from cvcdepth_core.images.decoding import Picture
-from cvcdepth_core.rig.rig import Rig, RigLayout
+from cvcdepth_core.rig.rig import Rig
+from cvcdepth_core.rig.rig_file import RigLayout
 from cvcdepth_ros.bags import RecordedMessage, Recording
 from cvcdepth_ros.messages.conversion import picture_from_message
 from cvcdepth_ros.messages.rig_assembly import RigAssembler

@@ -8,7 +8,7 @@ import numpy as np
 
 from cvcdepth_core.errors import ImageError, RigError
 from cvcdepth_core.images.decoding import Picture
-from cvcdepth_core.images.rectifier import SurroundPreprocessor
+from cvcdepth_core.images.surround import SurroundPreprocessor
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.rig_health.swapped_cameras import Exchange, PlacedPictures, best_exchange
 from cvcdepth_ros.checks.context import CheckContext, CheckResult, Status

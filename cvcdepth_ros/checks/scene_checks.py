@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvcdepth_core.errors import RecordingError, RigError, TransformError
-from cvcdepth_core.images.rectifier import Rectifier, self_occlusion_mask
+from cvcdepth_core.images.rectifier import Rectifier
+from cvcdepth_core.images.surround import self_occlusion_mask
 from cvcdepth_core.rig.rig import Camera, Rig
-from cvcdepth_core.scoring.ground_truth import PinholeView
 from cvcdepth_ros.checks.context import CheckContext, CheckResult, Status
 from cvcdepth_ros.messages.conversion import stamp_ns
 from cvcdepth_ros.messages.transforms import TransformTree
@@ -185,7 +185,7 @@ def _nearest(times: NDArray[np.int64], stamp: int) -> int:
 
 
 def _share_inside(camera: Camera, points: NDArray[np.float64]) -> float:
-    view = PinholeView.of(camera)
+    view = camera.rectified_view
     (u, v), z = (found.T for found in view.project(points))
     nearest, farthest = _PLAUSIBLE_DEPTH
     inside = (u >= -0.5) & (u < view.width - 0.5) & (v >= -0.5) & (v < view.height - 0.5)

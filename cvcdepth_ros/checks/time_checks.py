@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from cvcdepth_core.rig.rig import RigLayout
+from cvcdepth_core.rig.rig_file import RigLayout
 from cvcdepth_ros.checks.context import CheckContext, CheckResult, Status
 from cvcdepth_ros.recordings.topic_timing import Timing
 from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS, SurroundSet

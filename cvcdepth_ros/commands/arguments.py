@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin
 
 from pydantic import ValidationError
 
-from cvcdepth_core.errors import ConfigError
-from cvcdepth_core.rig.calibration import first_validation_message
+from cvcdepth_core.errors import ConfigError, first_validation_message
 from cvcdepth_ros.settings import ModelSettings
 
 if TYPE_CHECKING:

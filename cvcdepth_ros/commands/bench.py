@@ -15,7 +15,7 @@ from cvcdepth_ros.settings import ModelSettings
 from cvcdepth_ros.version import package_version
 
 if TYPE_CHECKING:
-    from cvcdepth_core.rig.rig import RigLayout
+    from cvcdepth_core.rig.rig_file import RigLayout
     from cvcdepth_ros.end_to_end.live_run import LiveOutcome
     from cvcdepth_ros.end_to_end.paths import DemoPaths
 
@@ -63,7 +63,7 @@ def _measure(
     folder: Path, name: str, played: Path, layout: "RigLayout", model: ModelSettings, arguments: argparse.Namespace
 ) -> dict[str, Any]:
     """Run one of the nodes."""
-    from cvcdepth_core.rig.rig import save_rig_layout
+    from cvcdepth_core.rig.rig_file import save_rig_layout
     from cvcdepth_ros.end_to_end.live_run import LiveRun
     from cvcdepth_ros.end_to_end.paths import DemoPaths
     from cvcdepth_ros.end_to_end.processes import children

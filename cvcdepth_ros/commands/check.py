@@ -27,7 +27,7 @@ from cvcdepth_ros.commands.arguments import (
 from cvcdepth_ros.settings import MatchingSettings
 
 if TYPE_CHECKING:
-    from cvcdepth_core.rig.rig import RigLayout
+    from cvcdepth_core.rig.rig_file import RigLayout
     from cvcdepth_ros.bags import Location
     from cvcdepth_ros.checks import NumberedResult, Status
 
@@ -83,7 +83,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(arguments: argparse.Namespace) -> None:
     """Check each recording; RecordingError at the end when a check failed."""
-    from cvcdepth_core.rig.rig import load_rig_layout
+    from cvcdepth_core.rig.rig_file import load_rig_layout
     from cvcdepth_ros.bags import find_recordings
 
     refuse_unknown_checks(arguments)

@@ -179,7 +179,7 @@ def _pool(arguments: argparse.Namespace, settings: EvaluationSettings) -> "Abstr
 
 
 def _jobs(arguments: argparse.Namespace, settings: EvaluationSettings) -> list[EvaluationJob]:
-    from cvcdepth_core.rig.rig import load_rig_layout
+    from cvcdepth_core.rig.rig_file import load_rig_layout
     from cvcdepth_ros.bags import find_recordings
 
     locations = find_recordings(arguments.recordings)

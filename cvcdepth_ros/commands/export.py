@@ -3,9 +3,10 @@
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from cvcdepth_core.errors import ConfigError
+from cvcdepth_core.model_choices import PRECISIONS, Precision
 from cvcdepth_ros.commands.arguments import add_json, print_result, refuse_to_overwrite
 from cvcdepth_ros.version import package_version
 
@@ -42,9 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, metavar="OUT", help="ONNX file to write [CHECKPOINT.onnx]")
     parser.add_argument("--force", action="store_true", help="overwrite the files")
     parser.add_argument("--tensorrt", action="store_true", help="build a TensorRT engine instead")
-    parser.add_argument(
-        "--precision", choices=("float32", "bfloat16", "float16"), help="of the TensorRT engine [float32]"
-    )
+    parser.add_argument("--precision", choices=PRECISIONS, help="of the TensorRT engine [float32]")
     parser.add_argument("--device", metavar="TEXT", help="GPU to build the TensorRT engine for [cuda]")
     add_json(parser)
 
@@ -81,9 +80,7 @@ def _write_onnx(checkpoint: "Checkpoint", output: Path | None, force: bool) -> t
     return path, error
 
 
-def _build_tensorrt(
-    checkpoint: "Checkpoint", precision: Literal["float32", "bfloat16", "float16"], device: str
-) -> tuple[Path, float]:
+def _build_tensorrt(checkpoint: "Checkpoint", precision: Precision, device: str) -> tuple[Path, float]:
     from cvcdepth_core.engines import build_tensorrt
 
     return build_tensorrt(checkpoint.build_depth_net(), checkpoint.spec, device, precision)

@@ -95,7 +95,7 @@ def _fine_tuned(arguments: argparse.Namespace, processes: "Processes") -> "FineT
 def _order(arguments: argparse.Namespace) -> "Order":
     from cvcdepth_core.model_choices import checkpoint_path
     from cvcdepth_core.networks.checkpoint import load_checkpoint
-    from cvcdepth_core.rig.rig import load_rig_layout
+    from cvcdepth_core.rig.rig_file import load_rig_layout
     from cvcdepth_core.training.config import load_training_config
     from cvcdepth_ros.bags import find_recordings
     from cvcdepth_ros.finetuning.preparation import Source

@@ -11,7 +11,8 @@ from cvcdepth_ros.commands.arguments import add_json, add_recording, print_resul
 from cvcdepth_ros.version import package_version
 
 if TYPE_CHECKING:
-    from cvcdepth_core.rig.rig import Camera, Rig, RigLayout
+    from cvcdepth_core.rig.rig import Camera, Rig
+    from cvcdepth_core.rig.rig_file import RigLayout
     from cvcdepth_ros.bags import Location
 
 SUMMARY = """Write a rig file from a recording.
@@ -41,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(arguments: argparse.Namespace) -> None:
     """Write the rig file and show what is in it."""
-    from cvcdepth_core.rig.rig import save_rig_layout
+    from cvcdepth_core.rig.rig_file import save_rig_layout
     from cvcdepth_ros.bags import open_recording
     from cvcdepth_ros.recordings.rig import discover_rig
 

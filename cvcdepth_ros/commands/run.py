@@ -29,7 +29,7 @@ from cvcdepth_ros.settings import MatchingSettings, MissingCameraSettings, Model
 from cvcdepth_ros.version import package_version
 
 if TYPE_CHECKING:
-    from cvcdepth_core.rig.rig import RigLayout
+    from cvcdepth_core.rig.rig_file import RigLayout
     from cvcdepth_ros.bags import Recording
     from cvcdepth_ros.recordings.replay import DepthReplay, EstimatedSet, SurroundReplay
     from cvcdepth_ros.surround_sets.latencies import StageLatencies
@@ -116,7 +116,7 @@ def _trace(path: Path | None) -> "Iterator[StageLatencies]":
 
 
 def _layout(arguments: argparse.Namespace, recording: "Recording") -> "RigLayout":
-    from cvcdepth_core.rig.rig import load_rig_layout
+    from cvcdepth_core.rig.rig_file import load_rig_layout
     from cvcdepth_ros.recordings.rig import discover_rig
 
     return load_rig_layout(arguments.rig) if arguments.rig else discover_rig(recording, arguments.base_frame)

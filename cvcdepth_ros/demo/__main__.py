@@ -16,9 +16,8 @@ import yaml
 from pydantic import ValidationError
 from tqdm import tqdm
 
-from cvcdepth_core.errors import ConfigError, CvcDepthError
-from cvcdepth_core.rig.calibration import first_validation_message
-from cvcdepth_core.rig.rig import RigLayout, load_rig_layout
+from cvcdepth_core.errors import ConfigError, CvcDepthError, first_validation_message
+from cvcdepth_core.rig.rig_file import RigLayout, load_rig_layout
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.commands.arguments import positive
 from cvcdepth_ros.demo.pace import manageable_rate

@@ -7,7 +7,7 @@ import time
 import torch
 
 from cvcdepth_core.estimator import SurroundDepthEstimator
-from cvcdepth_core.rig.rig import RigLayout
+from cvcdepth_core.rig.rig_file import RigLayout
 from cvcdepth_ros.bags import Recording
 from cvcdepth_ros.end_to_end.processes import THREADS_VARIABLE, spared_threads
 from cvcdepth_ros.settings import ModelSettings

@@ -2,7 +2,7 @@
 """The LiDAR of a recording, at the moments of its surround sets."""
 
 from cvcdepth_core.errors import TransformError
-from cvcdepth_core.rig.rig import RigLayout
+from cvcdepth_core.rig.rig_file import RigLayout
 from cvcdepth_core.visualization import Points
 from cvcdepth_ros.bags import RecordedMessage, Recording
 from cvcdepth_ros.recordings.lidar import LidarSweeps, VehicleMotion, find_lidars

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cvcdepth_core.rig.rig import RigLayout
+from cvcdepth_core.rig.rig_file import RigLayout
 from cvcdepth_core.visualization import ColouredPoints
 from cvcdepth_ros.bags import Recording, open_recording
 from cvcdepth_ros.messages.conversion import picture_from_message, stamp_ns

@@ -5,7 +5,7 @@ import struct
 from pathlib import Path
 
 from cvcdepth_core.errors import RecordingError
-from cvcdepth_core.rig.rig import RigLayout
+from cvcdepth_core.rig.rig_file import RigLayout
 from cvcdepth_ros.bags import Recording, RecordingWriter
 
 _STAMP = 4  # where a CDR message's first field begins, which is the header's stamp

@@ -16,9 +16,10 @@ from cvcdepth_ros.version import package_version
 
 if TYPE_CHECKING:
     from cvcdepth_core.estimator import DepthPredictor
-    from cvcdepth_core.rig.rig import Rig, RigLayout
-    from cvcdepth_core.scoring.ground_truth import OcclusionFilter
+    from cvcdepth_core.rig.rig import Rig
+    from cvcdepth_core.rig.rig_file import RigLayout
     from cvcdepth_core.scoring.scores import ScoreSettings
+    from cvcdepth_core.scoring.sparse_depth import OcclusionFilter
 
 
 class Dependencies(NamedTuple):
@@ -66,7 +67,7 @@ class EvaluationSettings(MatchingSettings, ModelSettings):
     @property
     def occlusion(self) -> OcclusionFilter | None:
         """Which LiDAR points are no truth."""
-        from cvcdepth_core.scoring.ground_truth import OcclusionFilter
+        from cvcdepth_core.scoring.sparse_depth import OcclusionFilter
 
         return None if self.no_occlusion_filter else OcclusionFilter()
 

@@ -16,10 +16,13 @@ import torch
 from numpy.typing import NDArray
 
 from cvcdepth_core.errors import RecordingError
+from cvcdepth_core.rendering.agreement import PosedDepth
 from cvcdepth_core.rig.poses import Pose
-from cvcdepth_core.scoring.consistency import AgreementTable, PosedDepth, spatial_rows, temporal_rows
-from cvcdepth_core.scoring.ground_truth import PinholeView, SparseDepth, overlap_pixels, sample_prediction
-from cvcdepth_core.scoring.scores import DepthSamples, Scores, SurroundScorer
+from cvcdepth_core.scoring.consistency import AgreementTable, spatial_rows, temporal_rows
+from cvcdepth_core.scoring.ground_truth import overlap_pixels, sample_prediction
+from cvcdepth_core.scoring.scorer import DepthSamples, SurroundScorer
+from cvcdepth_core.scoring.scores import Scores
+from cvcdepth_core.scoring.sparse_depth import SparseDepth
 from cvcdepth_core.visualization import Points
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.evaluation.job import EvaluationJob
@@ -60,12 +63,12 @@ class MeasuredSet:
     @property
     def posed(self) -> PosedDepth:
         """The depth with the cameras' places."""
-        return PosedDepth.of(self.estimated.depth, self.estimated.rig, self.world_T_base)
+        return PosedDepth.from_rig(self.estimated.depth, self.estimated.rig, self.world_T_base)
 
     def samples(self) -> list[DepthSamples]:
         """Return what is scored of each camera."""
         rig, depth = self.estimated.rig, self.estimated.depth.depth
-        views = {camera.name: PinholeView.of(camera) for camera in rig.cameras}
+        views = {camera.name: camera.rectified_view for camera in rig.cameras}
         found = []
         for name, truth, prediction in zip(rig.names, self.truth, depth, strict=True):
             others = [views[other] for other in rig.neighbours[name]]

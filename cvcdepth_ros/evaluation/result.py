@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -13,10 +12,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from cvcdepth_core.errors import ConfigError, RecordingError
+from cvcdepth_core.files import nan_to_null
 from cvcdepth_core.scoring.comparison import Comparison, compare
 from cvcdepth_core.scoring.consistency import AgreementTable, summarise_agreement
-from cvcdepth_core.scoring.scores import SCALINGS, Scaling, Scores, Summary
-from cvcdepth_core.scoring.scores import Protocol as ScoreProtocol
+from cvcdepth_core.scoring.scores import SCALINGS, EvaluationProtocol, Scaling, Scores, Summary
 from cvcdepth_ros.evaluation.image_scores import ImageScore, SetScore, correlations, image_scores
 from cvcdepth_ros.evaluation.job import Dependencies, EvaluationJob
 from cvcdepth_ros.evaluation.measuring import RecordingScores
@@ -24,7 +23,7 @@ from cvcdepth_ros.evaluation.measuring import RecordingScores
 SCHEMA = 2
 _DECIDE_WHAT_IS_MEASURED = ("rig", "base_frame", "tolerance", "lidar", "lidar_tolerance", "no_occlusion_filter")
 
-PROTOCOLS: tuple[ScoreProtocol, ...] = ("image", "pool")
+PROTOCOLS: tuple[EvaluationProtocol, ...] = ("image", "pool")
 
 
 class Failure(NamedTuple):
@@ -96,7 +95,7 @@ class EvaluationResult:
         numbers = chain.from_iterable(range(len(table)) for table in self.scores.images)
         return list(map(SetScore.of, numbers, image_scores(self.scores, self.agreement)))
 
-    def summary(self, protocol: ScoreProtocol = "image", scaling: Scaling = "metric") -> Summary:
+    def summary(self, protocol: EvaluationProtocol = "image", scaling: Scaling = "metric") -> Summary:
         """Take the means over all recordings."""
         return self.scores.summary(protocol, scaling)
 
@@ -115,7 +114,7 @@ class EvaluationResult:
             "sets": len(self.sets),
             "truth_points": self.truth_points,
             "scores": {p: {s: self.summary(p, s).to_json() for s in SCALINGS} for p in PROTOCOLS},
-            "scale_ratio": {p: _without_nan(self.scores.scale_ratios(p)) for p in PROTOCOLS},
+            "scale_ratio": {p: nan_to_null(self.scores.scale_ratios(p)) for p in PROTOCOLS},
             "label_free": self._label_free(),
             "recordings": [recording.summary for recording in self.recordings],
             "failed": [failure._asdict() for failure in self.failed],
@@ -124,10 +123,10 @@ class EvaluationResult:
 
     def _label_free(self) -> dict[str, Any]:
         pairs = [
-            {"kind": kind, "camera": camera, "other": other} | _without_nan(found._asdict())
+            {"kind": kind, "camera": camera, "other": other} | nan_to_null(found._asdict())
             for (kind, camera, other), found in summarise_agreement(self.agreement).items()
         ]
-        return {"pairs": pairs, "rank_correlation_with_abs_rel": _without_nan(correlations(self.sets))}
+        return {"pairs": pairs, "rank_correlation_with_abs_rel": nan_to_null(correlations(self.sets))}
 
 
 @dataclass(frozen=True)
@@ -183,8 +182,4 @@ def _without_differences(comparison: Comparison) -> dict[str, Any]:
 
 
 def _differences(comparison: Comparison) -> dict[str, Any]:
-    return {name: _without_nan(asdict(difference)) for name, difference in comparison.differences.items()}
-
-
-def _without_nan(numbers: Mapping[str, float]) -> dict[str, float | None]:
-    return {name: None if math.isnan(number) else number for name, number in numbers.items()}
+    return {name: nan_to_null(asdict(difference)) for name, difference in comparison.differences.items()}

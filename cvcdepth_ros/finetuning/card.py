@@ -15,11 +15,11 @@ from typing import Any
 import torch
 
 from cvcdepth_core.errors import CvcDepthError
-from cvcdepth_core.files import write_atomically, write_json
+from cvcdepth_core.files import nan_to_null, write_atomically, write_json
 from cvcdepth_core.networks.checkpoint import load_checkpoint
 from cvcdepth_ros.bags import file_identities
 from cvcdepth_ros.evaluation.result import EvaluationResult
-from cvcdepth_ros.finetuning.judgement import camera_numbers, known, numbers_of
+from cvcdepth_ros.finetuning.judgement import camera_numbers, numbers_of
 from cvcdepth_ros.finetuning.run import FineTuned
 from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS
 from cvcdepth_ros.training_data.index import RecordingIndex
@@ -79,7 +79,7 @@ def card_text(card: Mapping[str, Any]) -> str:
 def _scores(result: EvaluationResult | None) -> dict[str, Any] | None:
     if result is None:
         return None
-    return {"held_out": known(numbers_of(result)), "cameras": camera_numbers(result)}
+    return {"held_out": nan_to_null(numbers_of(result)), "cameras": camera_numbers(result)}
 
 
 def _recording(tuned: FineTuned, number: int) -> dict[str, Any]:

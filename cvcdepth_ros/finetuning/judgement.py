@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from cvcdepth_core.errors import ConfigError
+from cvcdepth_core.files import nan_to_null
 from cvcdepth_core.scoring.comparison import SETS_TO_PROVE, Comparison, Difference, SetValues, compare, compare_values
 from cvcdepth_core.scoring.scores import ALL, mean
 from cvcdepth_ros.evaluation.image_scores import ImageScore
@@ -47,14 +48,14 @@ class Verdict:
         comparison = None
         if self.comparison is not None:
             comparison = {name: value for name, value in asdict(self.comparison).items() if name != "differences"}
-            differences = {name: known(asdict(one)) for name, one in self.comparison.differences.items()}
+            differences = {name: nan_to_null(asdict(one)) for name, one in self.comparison.differences.items()}
             comparison["differences"] = differences
         return {
             "promoted": self.promoted,
             "reason": self.reason,
             "basis": self.basis,
             "score": self.score,
-            "difference": None if self.difference is None else known(asdict(self.difference)),
+            "difference": None if self.difference is None else nan_to_null(asdict(self.difference)),
             "comparison": comparison,
         }
 
@@ -105,18 +106,13 @@ def numbers_of(result: EvaluationResult) -> dict[str, float]:
 def camera_numbers(result: EvaluationResult) -> dict[str, dict[str, float | None]]:
     """Return the numbers of each camera; None for what could not be measured."""
     cameras = result.summary().cameras
-    return {camera: known(_camera_numbers(result, camera, cameras[camera][ALL].metrics)) for camera in cameras}
+    return {camera: nan_to_null(_camera_numbers(result, camera, cameras[camera][ALL].metrics)) for camera in cameras}
 
 
 def photometric(image: ImageScore) -> float:
     """Return the image's label-free score."""
     errors = (image.label_free.spatial_photometric, image.label_free.temporal_photometric)
     return mean([error for error in errors if not math.isnan(error)] or [_UNEXPLAINED])
-
-
-def known(numbers: Mapping[str, float]) -> dict[str, float | None]:
-    """Put None in the place of NaN, which JSON does not have."""
-    return {name: None if math.isnan(number) else number for name, number in numbers.items()}
 
 
 def _not_scored(before: EvaluationResult, after: EvaluationResult) -> str:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from cvcdepth_core.errors import CvcDepthError, RecordingError
 from cvcdepth_core.files import write_atomically
-from cvcdepth_core.rig.rig import RigLayout
+from cvcdepth_core.rig.rig_file import RigLayout
 from cvcdepth_ros.bags import Location, file_identities, open_recording
 from cvcdepth_ros.checks import CheckContext, CheckOptions, CheckResult, NumberedResult, run_checks
 from cvcdepth_ros.settings import MatchingSettings

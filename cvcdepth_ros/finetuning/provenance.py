@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import hashlib
 
-from cvcdepth_core.rig.rig import RigLayout
+from cvcdepth_core.rig.rig_file import RigLayout
 from cvcdepth_ros.finetuning.preparation import Prepared
 from cvcdepth_ros.training_data.index import RecordingIndex
 

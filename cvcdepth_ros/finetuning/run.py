@@ -77,7 +77,7 @@ def fine_tune(order: Order, processes: Processes, tell: Tell) -> FineTuned | Non
 
     What a former call in the same folder has finished is not done again.
     """
-    with processes.first_goes_ahead():
+    with processes.first_process_first():
         prepared = prepare(order.source, order.run)
     if processes.is_first:
         _tell_of_losses(prepared, order, tell)

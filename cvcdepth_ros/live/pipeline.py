@@ -20,7 +20,8 @@ from typing import Any
 from cvcdepth_core.errors import CvcDepthError, EngineError, ImageError
 from cvcdepth_core.estimator import DepthPredictor, PictureSize, SurroundDepthEstimator
 from cvcdepth_core.images.decoding import Picture
-from cvcdepth_core.images.rectifier import Rectifier, SurroundPreprocessor
+from cvcdepth_core.images.rectifier import Rectifier
+from cvcdepth_core.images.surround import SurroundPreprocessor
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.surround_depth import SurroundDepth
 from cvcdepth_ros.live.camera_states import CameraWatch

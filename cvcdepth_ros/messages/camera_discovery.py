@@ -7,7 +7,7 @@ A camera is a namespace with a `camera_info` and at least one image topic (image
 import re
 from collections.abc import Mapping
 
-from cvcdepth_core.rig.rig import CameraEntry
+from cvcdepth_core.rig.rig_file import CameraEntry
 
 IMAGE_TYPE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE_TYPE = "sensor_msgs/msg/CompressedImage"

@@ -7,7 +7,8 @@ from typing import Any
 from cvcdepth_core.errors import RigError, TransformError
 from cvcdepth_core.rig.calibration import Calibration
 from cvcdepth_core.rig.poses import Pose
-from cvcdepth_core.rig.rig import Camera, CameraEntry, PoseEntry, Rig, RigLayout, order_around_vehicle
+from cvcdepth_core.rig.rig import Camera, Rig, order_around_vehicle
+from cvcdepth_core.rig.rig_file import CameraEntry, PoseEntry, RigLayout
 from cvcdepth_ros.messages.conversion import calibration_from_message
 from cvcdepth_ros.messages.transforms import TransformTree
 

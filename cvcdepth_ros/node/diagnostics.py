@@ -106,7 +106,7 @@ def overlap_status(monitor: OverlapMonitor) -> DiagnosticStatus:
     for (camera, neighbour), pair in monitor.pairs().items():
         values[f"{camera} - {neighbour}: turned (deg)"] = pair.misalignment
         values[f"{camera} - {neighbour}: depth differs by"] = pair.disagreement
-        values[f"{camera} - {neighbour}: usually by"] = pair.usual_disagreement
+        values[f"{camera} - {neighbour}: usually by"] = pair.baseline_disagreement
     values |= {f"{camera}: sharper by (log)": change for camera, change in monitor.sharpness_changes().items()}
     findings = "; ".join(map(str, monitor.findings()))
     return status(WARN if findings else OK, "cross-view consistency", findings or "ok", values)

@@ -10,7 +10,7 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo
 
 from cvcdepth_core.errors import CvcDepthError
-from cvcdepth_core.rig.rig import CameraEntry, RigLayout
+from cvcdepth_core.rig.rig_file import CameraEntry, RigLayout
 from cvcdepth_ros.messages.camera_discovery import discover_cameras
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
 from cvcdepth_ros.messages.transforms import TransformTree

@@ -9,8 +9,7 @@ from pydantic.fields import FieldInfo
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
 
-from cvcdepth_core.errors import ConfigError
-from cvcdepth_core.rig.calibration import first_validation_message
+from cvcdepth_core.errors import ConfigError, first_validation_message
 from cvcdepth_ros.settings import MatchingSettings, MissingCameraSettings, ModelSettings, OutputSettings
 
 AUTO = "auto"

@@ -19,7 +19,7 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from cvcdepth_core.errors import ConfigError, TransformError
-from cvcdepth_core.rig.rig import CameraEntry, RigLayout
+from cvcdepth_core.rig.rig_file import CameraEntry, RigLayout
 from cvcdepth_ros.live.camera_states import CameraState, Trouble
 from cvcdepth_ros.messages.camera_discovery import COMPRESSED_IMAGE_TYPE, IMAGE_TYPE
 from cvcdepth_ros.messages.transforms import TransformTree

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from cvcdepth_core.errors import CvcDepthError, RecordingError, RigError
 from cvcdepth_core.estimator import DepthPredictor, SurroundDepthEstimator
-from cvcdepth_core.rig.rig import Rig, RigLayout
+from cvcdepth_core.rig.rig import Rig
+from cvcdepth_core.rig.rig_file import RigLayout
 from cvcdepth_core.surround_depth import SurroundDepth
 from cvcdepth_ros.bags import RecordedMessage, Recording
 from cvcdepth_ros.messages.conversion import stamp_ns

@@ -8,9 +8,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from cvcdepth_core.errors import RecordingError, RigError, TransformError
-from cvcdepth_core.rig.calibration import first_validation_message
-from cvcdepth_core.rig.rig import CameraEntry, RigLayout
+from cvcdepth_core.errors import RecordingError, RigError, TransformError, first_validation_message
+from cvcdepth_core.rig.rig_file import CameraEntry, RigLayout
 from cvcdepth_ros.bags import Recording
 from cvcdepth_ros.messages.camera_discovery import CAMERA_INFO_TYPE, COMPRESSED_IMAGE_TYPE, IMAGE_TYPE, discover_cameras
 from cvcdepth_ros.messages.rig_assembly import RigAssembler

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from cvcdepth_core.errors import RecordingError, RigError
 from cvcdepth_core.rig.calibration import Calibration
-from cvcdepth_core.rig.rig import CameraEntry
+from cvcdepth_core.rig.rig_file import CameraEntry
 from cvcdepth_ros.bags import RecordedMessage, Recording
 from cvcdepth_ros.bags.topics import RecordingFile
 from cvcdepth_ros.messages.conversion import calibration_from_message

@@ -10,7 +10,8 @@ import numpy as np
 from cvcdepth_core.errors import CvcDepthError, RecordingError, TransformError
 from cvcdepth_core.rig.poses import Pose
 from cvcdepth_core.rig.rig import Rig
-from cvcdepth_core.scoring.ground_truth import OcclusionFilter, PinholeView, SparseDepth, sparse_depth
+from cvcdepth_core.scoring.ground_truth import sparse_depth
+from cvcdepth_core.scoring.sparse_depth import OcclusionFilter, SparseDepth
 from cvcdepth_core.visualization import Points
 from cvcdepth_ros.bags import RecordedMessage
 from cvcdepth_ros.recordings.lidar import CLOUD_TYPE, LidarSweeps, VehicleMotion, cloud_topics, find_lidars
@@ -68,7 +69,7 @@ class RecordedTruth:
         for camera in rig.cameras:
             points = self.points(times[camera.name])
             found = np.empty((0, 3)) if points is None else points
-            truth.append(sparse_depth(found, PinholeView.of(camera), occlusion))
+            truth.append(sparse_depth(found, camera.rectified_view, occlusion))
         return truth
 
     def base_poses(self, rig: Rig, times: Mapping[str, int]) -> list[Pose] | None:

@@ -15,7 +15,8 @@ from cvcdepth_core.images.decoding import Picture
 from cvcdepth_core.images.rectifier import Rectifier
 from cvcdepth_core.pointcloud import CloudLimits, merged_cloud
 from cvcdepth_core.rig.rig import Camera
-from cvcdepth_core.scoring.ground_truth import SparseDepth, sample_prediction
+from cvcdepth_core.scoring.ground_truth import sample_prediction
+from cvcdepth_core.scoring.sparse_depth import SparseDepth
 from cvcdepth_core.visualization import (
     ColouredPoints,
     DepthScale,

@@ -50,7 +50,7 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 from cvcdepth_core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from cvcdepth_core.rig.rig import RigLayout
+    from cvcdepth_core.rig.rig_file import RigLayout
 
 T = TypeVar("T")
 

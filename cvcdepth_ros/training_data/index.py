@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from cvcdepth_core.errors import CvcDepthError, ImageError, RecordingError, RigError, TransformError
 from cvcdepth_core.files import write_atomically
-from cvcdepth_core.rig.rig import RigLayout
+from cvcdepth_core.rig.rig_file import RigLayout
 from cvcdepth_ros.bags import Location, RecordedMessage, Recording, file_identities, open_recording
 from cvcdepth_ros.messages.conversion import picture_from_message
 from cvcdepth_ros.recordings.lidar import VehicleMotion

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cvcdepth_core.errors import ImageError
 from cvcdepth_core.files import write_atomically
-from cvcdepth_core.rig.rig import RigLayout
+from cvcdepth_core.rig.rig_file import RigLayout
 from cvcdepth_core.rig_health.own_body import MIN_TRAVEL, SelfOcclusionFinder
 from cvcdepth_core.training.config import RecordingsConfig
 from cvcdepth_ros.training_data.index import RecordingIndex

@@ -7,7 +7,6 @@ Pictures go through the node's own decoding and preprocessing, so that the netwo
 from __future__ import annotations
 
 import math
-from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -23,14 +22,15 @@ from torch.utils.data import DataLoader, Dataset
 
 from cvcdepth_core.errors import ImageError, RecordingError
 from cvcdepth_core.images.decoding import Picture
-from cvcdepth_core.images.rectifier import SurroundPreprocessor
+from cvcdepth_core.images.surround import SurroundPreprocessor
 from cvcdepth_core.networks.pose import MAX_TRANSLATION
 from cvcdepth_core.rig.poses import inverse
 from cvcdepth_core.training.batch import RigBatch
 from cvcdepth_core.training.config import RecordingsConfig, TrainingConfig
-from cvcdepth_core.training.distributed import ALONE, Processes
+from cvcdepth_core.training.distributed import SINGLE_PROCESS, Processes
 from cvcdepth_ros.bags import Recording, open_recording
 from cvcdepth_ros.messages.conversion import picture_from_message, stamp_ns
+from cvcdepth_ros.recently_used import RecentlyUsed
 from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS
 from cvcdepth_ros.training_data.index import RecordingIndex
 
@@ -190,28 +190,6 @@ class NetworkRig:
         )
 
 
-class PictureCache:
-    """Pictures by key, least recently used ones dropped beyond `limit` bytes."""
-
-    def __init__(self, limit: int) -> None:
-        self._limit = limit
-        self._pictures: OrderedDict[tuple[int, int], NDArray[np.uint8]] = OrderedDict()
-        self._size = 0
-
-    def get(self, key: tuple[int, int]) -> NDArray[np.uint8] | None:
-        """Return what was put there, or None."""
-        if key in self._pictures:
-            self._pictures.move_to_end(key)
-        return self._pictures.get(key)
-
-    def put(self, key: tuple[int, int], pictures: NDArray[np.uint8]) -> None:
-        """Keep `pictures` under a key that is not there yet."""
-        self._pictures[key] = pictures
-        self._size += pictures.nbytes
-        while self._size > self._limit:
-            self._size -= self._pictures.popitem(last=False)[1].nbytes
-
-
 class ReadSample(NamedTuple):
     """A training sample's content."""
 
@@ -244,7 +222,7 @@ class SampleReader(Dataset[ReadSample | None]):
         self.rigs = [NetworkRig.of(index, height, width) for index in indexes]
         self._indexes = list(indexes)
         self._exposure_motion = config.exposure_motion
-        self._cache = PictureCache(config.cache_mb * 2**20)
+        self._cache: RecentlyUsed[tuple[int, int], NDArray[np.uint8]] = RecentlyUsed(config.cache_mb * 2**20)
         self._recordings: dict[int, Recording] = {}
 
     def __len__(self) -> int:
@@ -264,7 +242,7 @@ class SampleReader(Dataset[ReadSample | None]):
         pictures = self._cache.get((recording, row))
         if pictures is None:
             pictures = np.stack(list(self._rectified(recording, row)))
-            self._cache.put((recording, row), pictures)
+            self._cache.put((recording, row), pictures, pictures.nbytes)
         return pictures
 
     def camera_poses(self, recording: int, row: int) -> NDArray[np.float64]:
@@ -339,7 +317,9 @@ class RecordingBatches:
     networks of several processes together are of one rig, too.
     """
 
-    def __init__(self, indexes: Sequence[RecordingIndex], config: TrainingConfig, processes: Processes = ALONE) -> None:
+    def __init__(
+        self, indexes: Sequence[RecordingIndex], config: TrainingConfig, processes: Processes = SINGLE_PROCESS
+    ) -> None:
         """Find the samples; RecordingError names recording and values when there are none."""
         _refuse_unrecorded_motion(indexes, config.recordings)
         refuse_standstill(indexes, config.recordings)

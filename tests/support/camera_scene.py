@@ -17,7 +17,7 @@ from ros_graph import RosGraph, reliable
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from std_msgs.msg import String
 
-from cvcdepth_core.rig.rig import save_rig_layout
+from cvcdepth_core.rig.rig_file import save_rig_layout
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.recordings.rig import discover_rig
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from cvcdepth_core.rendering.projection import axis_angle_to_rotation, pixel_rays, rigid, rigid_inverse
+from cvcdepth_core.rendering.projection import axis_angle_to_rotation, rigid, rigid_inverse, unit_depth_points
 from cvcdepth_core.training.batch import RigBatch
 from cvcdepth_core.training.objective import Prediction
 
@@ -147,7 +147,7 @@ def render_plane(
 ) -> tuple[Tensor, Tensor]:
     """Return images [N, 3, H, W] and depths [N, 1, H, W] of the plane, by intersecting every pixel's ray with it."""
     normal = torch.tensor([*tilt, 1.0], dtype=FLOAT64)
-    rays = world_T_camera[:, :3, :3] @ pixel_rays(torch.linalg.inv(intrinsics), height, width)
+    rays = world_T_camera[:, :3, :3] @ unit_depth_points(torch.linalg.inv(intrinsics), height, width)
     origin = world_T_camera[:, :3, 3:]
     depth = (8.0 - normal @ origin).unsqueeze(1) / (normal @ rays).unsqueeze(1)
     points = origin + rays * depth

@@ -5,9 +5,11 @@ import math
 
 import numpy as np
 
-from cvcdepth_core.pointcloud import pixel_rays
+from cvcdepth_core.rendering.agreement import PosedDepth
 from cvcdepth_core.rig.calibration import Calibration
-from cvcdepth_core.rig.rig import Camera
+from cvcdepth_core.rig.pinhole import pixel_rays
+from cvcdepth_core.rig.rig import Camera, Rig
+from cvcdepth_core.surround_depth import SurroundDepth
 
 HEIGHT, WIDTH, FOCAL = 96, 160, 110.0
 K = np.array([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]])
@@ -43,3 +45,14 @@ def cast(world_T_camera: np.ndarray, post: bool) -> tuple[np.ndarray, np.ndarray
     x, y, z = np.moveaxis(origin + rays * depth[..., None], -1, 0)
     waves = [np.sin(2.1 * y + 1.3 * z + x), np.cos(1.7 * x - 2.3 * y), np.sin(1.9 * z - 0.8 * y + 0.5 * x)]
     return depth.astype(np.float32), np.rint(127 + 100 * np.stack(waves, axis=-1)).astype(np.uint8)
+
+
+RIG = Rig((camera("left", 0.4, 8.0), camera("right", -0.4, -8.0)), "base_link", "left", {})
+
+
+def seen(world_T_base: np.ndarray | None = None, post: bool = True) -> PosedDepth:
+    """What the rig sees from a place, with the right depth and the right poses."""
+    poses = [(np.eye(4) if world_T_base is None else world_T_base) @ camera.base_T_camera for camera in RIG.cameras]
+    depth, pictures = map(np.stack, zip(*(cast(pose, post) for pose in poses), strict=True))
+    surround = SurroundDepth(depth, pictures, np.stack([K, K]), np.ones(2, bool))
+    return PosedDepth.from_rig(surround, RIG, None if world_T_base is None else [world_T_base] * 2)

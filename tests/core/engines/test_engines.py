@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from cvcdepth_core.engines import BACKENDS, Precision, build_engine, is_installed, selection
+from cvcdepth_core.engines import build_engine, is_installed, selection
 from cvcdepth_core.engines.engine import DeviceMemoryError
 from cvcdepth_core.engines.example_rigs import ring_of_cameras
 from cvcdepth_core.engines.guarded_engine import GuardedEngine
@@ -22,13 +22,13 @@ from cvcdepth_core.engines.rewriting import RewrittenDepthNet
 from cvcdepth_core.engines.torch_engine import MixedPrecision, PaddedBatches, TorchEagerEngine, TorchEngine
 from cvcdepth_core.errors import ConfigError, EngineError
 from cvcdepth_core.estimator import DepthEstimator
-from cvcdepth_core.images.rectifier import to_tensor
-from cvcdepth_core.networks import ENCODERS, DepthNet, RigImages, disparity_to_depth
+from cvcdepth_core.images.surround import to_tensor
+from cvcdepth_core.model_choices import ENCODERS, Precision
+from cvcdepth_core.networks import DepthNet, RigImages, disparity_to_depth
 from cvcdepth_core.networks.checkpoint import save_checkpoint
 from cvcdepth_core.networks.registry import DepthModelSpec
 from cvcdepth_core.surround_depth import SurroundPictures
 from cvcdepth_ros.bag_replay import main
-from cvcdepth_ros.settings import ModelSettings
 
 HEIGHT, WIDTH = 64, 96
 CPU = torch.device("cpu")
@@ -354,12 +354,6 @@ def test_an_exported_model_takes_any_number_and_size_of_pictures():
     (disparity,) = session.run(["disparity"], {"images": images.numpy()})
     with torch.inference_mode():
         np.testing.assert_allclose(disparity, network.disparity(images).numpy(), rtol=1e-4)
-
-
-def test_the_settings_offer_the_backends_and_precisions_that_there_are():
-    fields = ModelSettings.model_fields
-    assert get_args(fields["backend"].annotation) == BACKENDS
-    assert get_args(fields["precision"].annotation) == get_args(Precision)
 
 
 @needs_cuda

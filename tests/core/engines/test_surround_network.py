@@ -9,12 +9,13 @@ import pytest
 import torch
 from mean_feature_network import KIND, SPEC_FIELDS, MeanFeatureNet, register
 
-from cvcdepth_core.engines import BACKENDS, build_engine, is_installed, selection
+from cvcdepth_core.engines import build_engine, is_installed, selection
 from cvcdepth_core.engines.engine import DeviceMemoryError
 from cvcdepth_core.engines.example_rigs import ring_of_cameras
 from cvcdepth_core.engines.guarded_engine import GuardedEngine
 from cvcdepth_core.errors import CheckpointError, ConfigError, EngineError
 from cvcdepth_core.estimator import DepthEstimator
+from cvcdepth_core.model_choices import BACKENDS
 from cvcdepth_core.networks import DepthModelSpec, RigImages, build_depth_network, disparity_to_depth
 from cvcdepth_core.networks.checkpoint import load_checkpoint, save_checkpoint
 from cvcdepth_core.surround_depth import SurroundPictures

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from repository import ROOT
 
 from cvcdepth_core.errors import ImageError, RigError
-from cvcdepth_core.images.rectifier import Rectifier, SurroundPreprocessor, self_occlusion_mask, to_tensor
+from cvcdepth_core.images.rectifier import Rectifier
+from cvcdepth_core.images.surround import SurroundPreprocessor, self_occlusion_mask, to_tensor
 from cvcdepth_core.rig.calibration import Calibration
 from cvcdepth_core.rig.rig import Camera, Rig
 

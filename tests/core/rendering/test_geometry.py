@@ -42,6 +42,7 @@ def random_poses(seed: int, *shape: int) -> Tensor:
     return rigid(axis_angle_to_rotation(vectors[0]), vectors[1])
 
 
+@settings(deadline=None)
 @given(seed=SEEDS, first=st.floats(-1, 1), second=st.floats(-1, 1), size=st.sampled_from([0.0, 1e-4, 0.09, 0.5]))
 def test_powers_of_a_motion_are_parts_of_its_way(seed, first, second, size):
     vectors = size * torch.randn(2, 5, 3, dtype=FLOAT64, generator=torch.Generator().manual_seed(seed))
@@ -61,6 +62,7 @@ def test_a_part_of_the_way_is_differentiable_at_standstill_and_elsewhere():
         assert torch.autograd.gradcheck(half, (size * torch.ones(6, dtype=FLOAT64)).requires_grad_())
 
 
+@settings(deadline=None)
 @given(seed=SEEDS)
 def test_poses_at_exposure_are_those_of_a_vehicle_with_constant_velocity_and_turn_rate(seed):
     generator = torch.Generator().manual_seed(seed)
@@ -92,6 +94,7 @@ def test_back_projected_pixels_project_to_where_they_came_from(seed, height, wid
     torch.testing.assert_close(z.view(depth.shape), depth)
 
 
+@settings(deadline=None)
 @given(seed=SEEDS)
 def test_poses_are_a_group(seed):
     a, b, c = random_poses(seed, 3)
@@ -102,6 +105,7 @@ def test_poses_are_a_group(seed):
     torch.testing.assert_close((a @ b) @ c, a @ (b @ c))
 
 
+@settings(deadline=None)
 @given(vector=st.tuples(ANGLES, ANGLES, ANGLES))
 def test_axis_angle_gives_rotations_that_keep_their_axis(vector):
     axis_angle = torch.tensor(vector, dtype=FLOAT64)
@@ -116,6 +120,7 @@ def test_axis_angle_is_differentiable_at_zero():
     assert torch.autograd.gradcheck(axis_angle_to_rotation, torch.zeros(2, 3, dtype=FLOAT64, requires_grad=True))
 
 
+@settings(deadline=None)
 @given(angles=st.tuples(ANGLES, ANGLES, ANGLES))
 def test_euler_angles_are_those_of_x_then_y_then_z(angles):
     turns = axis_angle_to_rotation(torch.diag(torch.tensor(angles, dtype=FLOAT64)))
@@ -124,6 +129,7 @@ def test_euler_angles_are_those_of_x_then_y_then_z(angles):
     )
 
 
+@settings(deadline=None)
 @given(seed=SEEDS)
 def test_forward_and_backward_motion_of_the_same_vector_are_inverse(seed):
     vectors = torch.randn(2, 4, 3, dtype=FLOAT64, generator=torch.Generator().manual_seed(seed))
@@ -131,6 +137,7 @@ def test_forward_and_backward_motion_of_the_same_vector_are_inverse(seed):
     torch.testing.assert_close(product, EYE.expand(4, 4, 4))
 
 
+@settings(deadline=None)
 @given(seed=SEEDS, anchor=st.integers(0, 3))
 def test_distributed_motion_respects_composition_and_comes_back_from_every_camera(seed, anchor):
     extrinsics = random_poses(seed, 2, 4)
@@ -142,6 +149,7 @@ def test_distributed_motion_respects_composition_and_comes_back_from_every_camer
     torch.testing.assert_close(seen, first.unsqueeze(2).expand_as(seen))
 
 
+@settings(deadline=None)
 @given(seed=SEEDS)
 def test_all_cameras_agree_on_where_the_vehicle_went(seed):
     extrinsics, vehicle = random_poses(seed, 2, 4), random_poses(seed + 1, 2, 1)
@@ -160,6 +168,7 @@ def test_relative_poses_close_every_loop_of_the_ring():
     torch.testing.assert_close(loop, EYE.expand(2, 4, 4))
 
 
+@settings(deadline=None)
 @given(seed=SEEDS, axis=st.integers(0, 2))
 def test_mirroring_motions_is_an_involution_that_respects_composition(seed, axis):
     a, b = random_poses(seed, 2, 3)

@@ -3,13 +3,12 @@
 
 import math
 
-import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from cvcdepth_core.errors import RigError
-from cvcdepth_core.rig.calibration import Calibration, calibration_from_fields, scale_intrinsics
+from cvcdepth_core.rig.calibration import Calibration, calibration_from_fields
 
 K = (500.0, 0.0, 320.5, 0.0, 510.0, 239.5, 0.0, 0.0, 1.0)
 P = (450.0, 0.0, 330.0, 0.0, 0.0, 460.0, 250.0, 0.0, 0.0, 0.0, 1.0, 0.0)
@@ -126,20 +125,3 @@ def test_binning_follows_the_region_of_interest_in_unbinned_pixels():
     # The centre of a binned pixel is the mean of its sensor pixels' centres.
     cx, cy = (320.5 - 100 - 0.5) / 2, (239.5 - 40 - 1.5) / 4
     assert calibration.raw_intrinsics == pytest.approx(_matrix(250.0, 127.5, cx, cy))
-
-
-@pytest.mark.parametrize("scale", [(0.5, 0.5), (0.4, 1 / 3), (2.0, 3.0)])
-def test_scaled_intrinsics_point_where_opencvs_resize_moves_the_picture(scale: tuple[float, float]):
-    ramp_x, ramp_y = np.meshgrid(np.arange(60, dtype=np.float32), np.arange(30, dtype=np.float32))
-    size = (round(60 * scale[0]), round(30 * scale[1]))
-    # A ramp resized bilinearly tells for each new pixel which old position it shows.
-    old_x, old_y = (cv2.resize(ramp, size, interpolation=cv2.INTER_LINEAR) for ramp in (ramp_x, ramp_y))
-    u, v = size[0] // 2, size[1] // 2
-    scaled = scale_intrinsics(np.eye(3), scale)
-    assert scaled @ [old_x[v, u], old_y[v, u], 1.0] == pytest.approx([u, v, 1.0], abs=1e-4)
-
-
-def test_scaling_leaves_the_given_matrix_alone():
-    intrinsics = _matrix(500.0, 510.0, 320.5, 239.5)
-    scale_intrinsics(intrinsics, (0.5, 0.5), (-10.0, -20.0))
-    assert np.array_equal(intrinsics, _matrix(500.0, 510.0, 320.5, 239.5))

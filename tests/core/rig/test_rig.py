@@ -15,18 +15,8 @@ from rosbags.typesys import Stores, get_typestore
 from cvcdepth_core.errors import RigError, TransformError
 from cvcdepth_core.rig.calibration import Calibration, RegionOfInterest
 from cvcdepth_core.rig.poses import Pose, pose_from_quaternion
-from cvcdepth_core.rig.rig import (
-    MIN_NEIGHBOUR_OVERLAP_DEG,
-    Camera,
-    CameraEntry,
-    PoseEntry,
-    Rig,
-    RigLayout,
-    load_rig_layout,
-    order_around_vehicle,
-    overlap_angle,
-    save_rig_layout,
-)
+from cvcdepth_core.rig.rig import MIN_NEIGHBOUR_OVERLAP_DEG, Camera, Rig, order_around_vehicle, overlap_angle
+from cvcdepth_core.rig.rig_file import CameraEntry, PoseEntry, RigLayout, load_rig_layout, save_rig_layout
 
 SAMPLE = ROOT / "samples" / "pandaset_002_excerpt"
 RIG_FILES = sorted((ROOT / "config" / "rigs").glob("*.yaml"))

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from recordings import SAMPLE
 
-from cvcdepth_core.images.rectifier import Rectifier, raw_pixels, self_occlusion_mask
+from cvcdepth_core.images.rectifier import Rectifier, raw_pixels
+from cvcdepth_core.images.surround import self_occlusion_mask
 from cvcdepth_core.rig.calibration import calibration_from_fields
-from cvcdepth_core.rig.rig import Camera, RigLayout, load_rig_layout
+from cvcdepth_core.rig.rig import Camera
+from cvcdepth_core.rig.rig_file import RigLayout, load_rig_layout
 from cvcdepth_core.rig_health.own_body import MIN_PAIRS, SelfOcclusionFinder
 from cvcdepth_ros.bag_replay import main
 

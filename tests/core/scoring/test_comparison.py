@@ -7,7 +7,8 @@ import pytest
 from cvcdepth_core.errors import ConfigError
 from cvcdepth_core.scoring.comparison import compare, compare_values, rank_correlation
 from cvcdepth_core.scoring.metrics import METRIC_NAMES
-from cvcdepth_core.scoring.scores import ALL, DepthSamples, Scores, ScoreSettings, SurroundScorer
+from cvcdepth_core.scoring.scorer import DepthSamples, SurroundScorer
+from cvcdepth_core.scoring.scores import ALL, Scores, ScoreSettings
 
 CAMERAS = ("front", "left")
 

@@ -8,7 +8,8 @@ from recordings import SAMPLE
 from cvcdepth_core.errors import ConfigError
 from cvcdepth_core.estimator import SurroundDepthEstimator
 from cvcdepth_core.pointcloud import CloudLimits, merged_cloud
-from cvcdepth_core.scoring.consistency import PosedDepth, spatial_rows
+from cvcdepth_core.rendering.agreement import PosedDepth
+from cvcdepth_core.scoring.consistency import spatial_rows
 from cvcdepth_core.scoring.references import constant_depth, ground_plane_depth
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.recordings.rig import discover_rig
@@ -44,8 +45,8 @@ def test_every_point_of_the_ground_plane_lies_on_it_unless_it_is_at_the_far_limi
 
 
 def test_the_ground_agrees_between_all_neighbours_and_a_constant_does_not(rig):
-    ground = PosedDepth.of(estimate(rig, ground_plane_depth(rig, height=192, width=320)), rig, None)
-    constant = PosedDepth.of(estimate(rig, constant_depth(rig, height=192, width=320)), rig, None)
+    ground = PosedDepth.from_rig(estimate(rig, ground_plane_depth(rig, height=192, width=320)), rig, None)
+    constant = PosedDepth.from_rig(estimate(rig, constant_depth(rig, height=192, width=320)), rig, None)
     flat = spatial_rows(rig, ground, max_depth=30.0)
     assert all(row.agreement.percentile_90 < 1e-3 for row in flat if row.agreement.pixels)
     assert sum(row.agreement.pixels > 300 for row in flat) >= 8

@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
 
-from cvcdepth_core.rendering.photometric import photometric_error, ssim_distance
+from cvcdepth_core.rendering.photometric import masked_mean, photometric_error, ssim_distance
 from cvcdepth_core.rendering.projection import axis_angle_to_rotation, rigid
-from cvcdepth_core.training.losses import masked_mean, pose_consistency, smoothness
+from cvcdepth_core.training.losses import pose_consistency, smoothness
 
 SEEDS = st.integers(0, 2**31)
 

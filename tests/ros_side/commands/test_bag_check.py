@@ -15,7 +15,7 @@ import yaml
 from recordings import CAMERAS, SAMPLE, Entry
 from repository import ROOT
 
-from cvcdepth_core.rig.rig import load_rig_layout
+from cvcdepth_core.rig.rig_file import load_rig_layout
 from cvcdepth_ros.bag_replay import main
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.checks import CHECKS, CheckContext, CheckOptions, run_checks

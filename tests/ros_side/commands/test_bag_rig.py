@@ -10,7 +10,7 @@ import pytest
 import recordings
 from recordings import CAMERAS, JAZZY, SAMPLE
 
-from cvcdepth_core.rig.rig import load_rig_layout
+from cvcdepth_core.rig.rig_file import load_rig_layout
 from cvcdepth_ros.bag_replay import main
 
 

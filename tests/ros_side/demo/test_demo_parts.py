@@ -10,7 +10,7 @@ import pytest
 from recordings import SAMPLE
 
 from cvcdepth_core.errors import ConfigError
-from cvcdepth_core.rig.rig import RigLayout
+from cvcdepth_core.rig.rig_file import RigLayout
 from cvcdepth_ros.bags import RecordingWriter, open_recording
 from cvcdepth_ros.demo.recorded_lidar import RecordedLidar
 from cvcdepth_ros.demo.result import DemoResult

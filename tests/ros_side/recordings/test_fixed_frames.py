@@ -11,7 +11,7 @@ import recordings
 from recordings import JAZZY, SAMPLE, Entry
 
 from cvcdepth_core.errors import TransformError
-from cvcdepth_core.rig.rig import RigLayout
+from cvcdepth_core.rig.rig_file import RigLayout
 from cvcdepth_ros.bag_replay import main
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.recordings.rig import assemble_rig, discover_rig

@@ -8,8 +8,10 @@ import pytest
 from recordings import SAMPLE
 
 from cvcdepth_core.errors import ConfigError, RecordingError, TransformError
-from cvcdepth_core.scoring.ground_truth import OcclusionFilter, PinholeView, sample_prediction, sparse_depth
-from cvcdepth_core.scoring.scores import ALL, DepthSamples, ScoreSettings, SurroundScorer
+from cvcdepth_core.scoring.ground_truth import sample_prediction, sparse_depth
+from cvcdepth_core.scoring.scorer import DepthSamples, SurroundScorer
+from cvcdepth_core.scoring.scores import ALL, ScoreSettings
+from cvcdepth_core.scoring.sparse_depth import OcclusionFilter
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.messages.transforms import PoseTrack, TransformTree
 from cvcdepth_ros.recordings.lidar import LidarSweeps, VehicleMotion, cloud_topics, points_from_message
@@ -252,7 +254,7 @@ def test_the_samples_lidar_as_prediction_has_no_error_in_any_camera(sample):
     for stamp in stamps[2:4]:
         images = []
         for camera in rig.cameras:
-            truth = sparse_depth(sweeps.at(stamp).points, PinholeView.of(camera), OcclusionFilter())
+            truth = sparse_depth(sweeps.at(stamp).points, camera.rectified_view, OcclusionFilter())
             prediction = sample_prediction(truth.image(), truth)
             images.append(DepthSamples(prediction, truth.depth, np.zeros(len(truth), dtype=bool)))
         scorer.add(stamp, images)

@@ -14,7 +14,7 @@ import torch
 from recordings import CAMERAS, JAZZY, SAMPLE, Entry, changed, cut, restamped, sample_entries, write_rosbag2
 
 from cvcdepth_core.errors import RecordingError, RigError
-from cvcdepth_core.images.rectifier import SurroundPreprocessor
+from cvcdepth_core.images.surround import SurroundPreprocessor
 from cvcdepth_core.networks.registry import DepthModelSpec
 from cvcdepth_core.training.config import OptimizerConfig, RecordingsConfig, TrainingConfig
 from cvcdepth_core.training.distributed import Processes

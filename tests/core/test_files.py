@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results are on the disk whole or not at all."""
+"""Results are on the disk whole or not at all; YAML gives plain values, and one kind of error whatever is wrong."""
 
 import os
 import subprocess
@@ -8,11 +8,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import yaml
 from recordings import SAMPLE
 
 from cvcdepth_core.errors import OutputError
-from cvcdepth_core.files import write_atomically
-from cvcdepth_core.rig.rig import RigLayout, save_rig_layout
+from cvcdepth_core.files import load_yaml, write_atomically
+from cvcdepth_core.rig.rig_file import RigLayout, save_rig_layout
 from cvcdepth_ros.bag_replay import main
 from cvcdepth_ros.evaluation.image_scores import write_csv
 from cvcdepth_ros.settings import MatchingSettings
@@ -104,3 +105,32 @@ def test_what_a_full_disk_does_not_take_of_run_json_is_not_left_half(tmp_path, m
 def test_a_folder_that_is_not_there_is_named(tmp_path):
     with pytest.raises(OutputError, match=r"none/scores.json: cannot be written: No such file or directory"):
         write_atomically(tmp_path / "none" / "scores.json", b"")
+
+
+def test_entries_are_merged_as_yaml_says():
+    text = "common: &common {fps: 10, mask: a.png}\n"
+    text += "front: {<<: *common, mask: b.png}\nback: {<<: [*common, {fps: 5, k: 1}]}\n"
+    content = load_yaml(text)
+    assert content == yaml.safe_load(text)
+    assert content["front"] == {"fps": 10, "mask": "b.png"}
+    assert content["back"] == {"fps": 10, "mask": "a.png", "k": 1}
+
+
+WRONG = {
+    "no end": "a: [",
+    "a function": "!!python/object/apply:os.system [true]",
+    "a date that is none": "2001-99-99",
+    "a time that is none": "!!timestamp soon",
+    "a number without digits": "!!int ''",
+    "nested without end": "[" * 100_000,
+    "merged with itself": "&a {<<: *a}",
+    "merged with a word": "{<<: word}",
+    "half a million merged entries": "a0: &a0 {k: 1}\n"
+    + "".join(f"a{n}: &a{n} {{<<: [{', '.join([f'*a{n - 1}'] * 9)}]}}\n" for n in range(1, 7)),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_whatever_is_wrong_with_yaml_is_one_kind_of_error(case: str):
+    with pytest.raises(yaml.YAMLError, match=r"."):
+        load_yaml(WRONG[case])

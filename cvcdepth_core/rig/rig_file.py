@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The rig file: a layout in YAML, which may leave calibrations and transforms to the recording or to live topics.
+
+`RigLayout.complete` joins it with those to a `Rig`, in which nothing is missing.
+"""
+
+import os
+from collections import Counter
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from cvcdepth_core.errors import RigError, TransformError, first_validation_message
+from cvcdepth_core.files import load_yaml, write_atomically
+from cvcdepth_core.rig.calibration import Calibration
+from cvcdepth_core.rig.poses import Pose, pose_from_quaternion, quaternion_from_rotation
+from cvcdepth_core.rig.rig import Camera, Rig
+
+# What a ROS topic takes between two slashes, since output topics carry the camera's name.
+_TOPIC_PART = r"^[A-Za-z][A-Za-z0-9_]*$"
+
+
+class PoseEntry(BaseModel):
+    """A rigid pose as ROS writes it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+    translation: tuple[float, float, float]
+    """x, y, z in metres."""
+    rotation: tuple[float, float, float, float]
+    """Unit quaternion x, y, z, w."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "PoseEntry":
+        try:
+            self.matrix("pose")
+        except TransformError as error:
+            raise ValueError(error) from error
+        return self
+
+    def matrix(self, name: str) -> Pose:
+        """Return the pose as a 4x4 matrix; errors call it `name`."""
+        return pose_from_quaternion(self.translation, self.rotation, name)
+
+    @classmethod
+    def from_matrix(cls, pose: Pose) -> "PoseEntry":
+        """Return the entry of a 4x4 pose."""
+        x, y, z = pose[:3, 3].tolist()
+        qx, qy, qz, qw = quaternion_from_rotation(pose[:3, :3]).tolist()
+        return cls(translation=(x, y, z), rotation=(qx, qy, qz, qw))
+
+
+class CameraEntry(BaseModel):
+    """One camera of a rig file. What is left out comes from the recording or from live topics."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+    name: str = Field(pattern=_TOPIC_PART)
+    """The camera's name, unique in the rig; output topics carry it, hence letters, digits and underscores only."""
+    image_topic: str = Field(min_length=1)
+    """Topic of its images (`sensor_msgs/Image` or `CompressedImage`)."""
+    camera_info_topic: str = Field(min_length=1)
+    """Topic of its `sensor_msgs/CameraInfo`."""
+    frame_id: str | None = None
+    """Its optical frame (REP 103: z forward, x right, y down); without it, the frame that CameraInfo names."""
+    rectified: bool = False
+    """Whether the topic carries rectified images (`image_rect`): then P describes them and D is not used."""
+    stamp_offset: float = Field(default=0.0, allow_inf_nan=False)
+    """Seconds by which its stamps are later than the anchor's for simultaneous exposures."""
+    mask: Path | None = None
+    """PNG of the image's size, 0 where the vehicle itself is in view, 255 elsewhere; relative to the rig file."""
+    mask_polygons: tuple[tuple[tuple[float, float], ...], ...] = ()
+    """Outlines of the vehicle itself, each of (x, y) in pixels of the raw image; they add to `mask`."""
+    calibration: Calibration | None = None
+    """Intrinsics and distortion; without them, those of CameraInfo."""
+    base_T_camera: PoseEntry | None = None
+    """Pose of the optical frame in the base frame; without it, that of `/tf_static`."""
+    neighbours: tuple[str, ...] | None = None
+    """Cameras that see some of the same space; without it, computed from the fields of view."""
+
+    @property
+    def stamp_offset_ns(self) -> int:
+        """`stamp_offset` in nanoseconds: a stamp minus this is the time of the exposure."""
+        return round(self.stamp_offset * 10**9)
+
+
+class RigLayout(BaseModel):
+    """The content of a rig file."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+    base_frame: str = "base_link"
+    """The vehicle's frame (REP 105): x forward, y left, z up."""
+    anchor: str | None = None
+    """The camera whose stamp a set carries and whose motion the pose network estimates; without it, the first."""
+    cameras: tuple[CameraEntry, ...]
+    """The cameras, in the order in which every array of a set holds them."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "RigLayout":
+        names = self.names
+        if len(names) < 2:
+            raise ValueError(f"a surround rig needs at least two cameras, found {len(names)}: {', '.join(names)}")
+        repeated = sorted({name for name in names if names.count(name) > 1})
+        if repeated:
+            raise ValueError(f"two cameras are called {', '.join(repeated)}")
+        for topic, count in Counter(camera.image_topic for camera in self.cameras).items():
+            if count > 1:
+                sharing = [camera.name for camera in self.cameras if camera.image_topic == topic]
+                raise ValueError(f"image_topic: {topic} is that of {' and '.join(sharing)}")
+        if self.anchor is not None and self.anchor not in names:
+            raise ValueError(f"anchor: no camera is called {self.anchor}; there are {', '.join(names)}")
+        for camera in self.cameras:
+            others = set(names) - {camera.name}
+            given = camera.neighbours or ()
+            unknown = [neighbour for neighbour in given if neighbour not in others]
+            if unknown:
+                raise ValueError(f"camera {camera.name}: neighbours: no other camera is called {', '.join(unknown)}")
+            if len(set(given)) < len(given):
+                raise ValueError(f"camera {camera.name}: neighbours: {', '.join(given)} names one twice")
+        return self
+
+    @property
+    def names(self) -> list[str]:
+        """The cameras' names, in order."""
+        return [camera.name for camera in self.cameras]
+
+    @property
+    def anchor_camera(self) -> str:
+        """The anchor's name: the one given, or the first camera's."""
+        return self.anchor or self.names[0]
+
+    def complete(
+        self, calibrations: Mapping[str, Calibration] | None = None, base_T_cameras: Mapping[str, Pose] | None = None
+    ) -> "Rig":
+        """Join the file with what the recording or the live topics say; what the file says has precedence.
+
+        Both arguments are keyed by camera name. RigError names the first camera that lacks a calibration or transform.
+        """
+        return Rig(
+            cameras=tuple(
+                Camera(
+                    entry.name,
+                    _calibration_of(entry, calibrations or {}),
+                    _pose_of(entry, base_T_cameras or {}, self.base_frame),
+                    entry.rectified,
+                    entry.mask,
+                    entry.mask_polygons,
+                )
+                for entry in self.cameras
+            ),
+            base_frame=self.base_frame,
+            anchor=self.anchor_camera,
+            given_neighbours={c.name: c.neighbours for c in self.cameras if c.neighbours is not None},
+        )
+
+
+def load_rig_layout(path: Path) -> RigLayout:
+    """Read a rig file. RigError names the file, the field and the value that is wrong."""
+    try:
+        content = load_yaml(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        reason = " ".join(str(error).split())
+        raise RigError(f"rig file {path}: cannot be read: {reason}") from error
+    try:
+        layout = RigLayout.model_validate(content)
+    except ValidationError as error:
+        raise RigError(f"rig file {path}: {first_validation_message(error)}") from error
+    return _with_masks(layout, lambda mask: path.parent / mask)
+
+
+def save_rig_layout(path: Path, layout: RigLayout, comment: str = "") -> None:
+    """Write a rig file, `comment` first, masks relative to it; `load_rig_layout` gives the same layout back.
+
+    Raises OutputError, naming the file, where the disk does not take it.
+    """
+    header = "".join(f"# {line}\n" for line in comment.splitlines())
+    relative = _with_masks(layout, lambda mask: Path(os.path.relpath(mask, path.parent)))
+    content = relative.model_dump(mode="json", exclude_defaults=True)
+    write_atomically(path, (header + yaml.safe_dump(content, sort_keys=False, default_flow_style=None)).encode())
+
+
+def _calibration_of(entry: CameraEntry, calibrations: Mapping[str, Calibration]) -> Calibration:
+    calibration = entry.calibration or calibrations.get(entry.name)
+    if calibration is None:
+        raise RigError(f"camera {entry.name}: no calibration in the rig file nor on {entry.camera_info_topic}")
+    return calibration
+
+
+def _pose_of(entry: CameraEntry, base_T_cameras: Mapping[str, Pose], base_frame: str) -> Pose:
+    if entry.base_T_camera is not None:
+        return entry.base_T_camera.matrix(f"camera {entry.name}: base_T_camera")
+    if entry.name not in base_T_cameras:
+        frame = entry.frame_id or "its optical frame"
+        raise TransformError(f"camera {entry.name}: no transform from {frame} to {base_frame}")
+    return base_T_cameras[entry.name]
+
+
+def _with_masks(layout: RigLayout, move: Callable[[Path], Path]) -> RigLayout:
+    cameras = tuple(
+        camera.model_copy(update={"mask": move(camera.mask)}) if camera.mask else camera for camera in layout.cameras
+    )
+    return layout.model_copy(update={"cameras": cameras})
