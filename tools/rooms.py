@@ -103,7 +103,7 @@ class Import(NamedTuple):
 
     importer: str
     imported: str
-    """A module, or what of a package cannot be found in the tree."""
+    """A module of the tree, or the name of something that is not in it."""
     line: int
     is_late: bool
     """Whether it is made only when a function is called, or for type checkers."""
@@ -176,11 +176,18 @@ def misplaced_ros(tree: Tree) -> list[str]:
                 found.append(f"{tree.told(entry)}, which needs ROS")
         elif FORMATS.fullmatch(_top(entry.imported)) and _top(entry.importer) == lowest:
             found.append(f"{tree.told(entry)}, which is about ROS's formats")
+    return [*found, *_idle_exceptions(tree)]
+
+
+def _idle_exceptions(tree: Tree) -> Iterator[str]:
+    """Name the modules that may import ROS and do not, and the patterns that fit no module."""
     with_ros = {entry.importer for entry in tree.imports if _is_ros(entry.imported)}
-    idle = (name for name in needing - with_ros if not tree.is_folder(name))
-    unknown = (p for p in (*house.needs_ros, *house.needs_ros_late) if not any(_matches(m, [p]) for m in tree.modules))
-    found += [f"{name} imports no ROS: its place is a room without ROS" for name in sorted(idle)]
-    return [*found, *(f"no module is called {pattern}" for pattern in unknown)]
+    for name in tree.modules:
+        if _matches(name, tree.house.needs_ros) and name not in with_ros and not tree.is_folder(name):
+            yield f"{name} imports no ROS: its place is a room without ROS"
+    for pattern in (*tree.house.needs_ros, *tree.house.needs_ros_late):
+        if not any(_matches(name, [pattern]) for name in tree.modules):
+            yield f"no module is called {pattern}"
 
 
 def table(tree: Tree) -> str:

@@ -87,8 +87,8 @@ def _training_config(path: Path) -> "TrainingConfig":
     config = load_training_config(path)
     if config.dataset != "recording":
         raise ConfigError(
-            f"{path}: dataset is {config.dataset!r}, for which there is no reader yet; to train with its settings on "
-            f"recordings, write a file of two lines, `base: {path.resolve()}` and `dataset: recording`"
+            f"{path}: dataset is {config.dataset!r}, for which there is no reader yet; to train on recordings, write "
+            f"`dataset: recording` in this file, or in a new one below `base: {path.resolve()}`"
         )
     return config
 

@@ -51,7 +51,7 @@ def test_finetune_refuses_a_data_set_in_one_line_with_file_field_value_and_remed
     (line,) = capsys.readouterr().err.splitlines()
     dataset = load_training_config(path).dataset
     assert f"{path}: dataset is {dataset!r}" in line
-    assert f"`base: {path}` and `dataset: recording`" in line
+    assert f"write `dataset: recording` in this file, or in a new one below `base: {path}`" in line
 
 
 @pytest.mark.parametrize("path", FOR_DATA_SETS, ids=name)
