@@ -128,7 +128,7 @@ class TrainingConfig(_Section):
     """Everything that determines a training run."""
 
     dataset: Literal["ddad", "nuscenes", "recording"] = "ddad"
-    """Where samples come from."""
+    """Where samples come from; of the data sets there is no reader yet."""
     depth: DepthModelSpec
     """The depth network; checkpoints carry this."""
     pose: PoseConfig = PoseConfig()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The loss terms of method section 6, one free function each; the photometric one is in `rendering.photometric`.
+"""The loss terms of method section 6, one free function each; the photometric error is in `rendering.photometric`.
 
 Images are [..., C, H, W] with any leading dimensions (samples, frames, cameras), which every reduction keeps: no term
 mixes samples or cameras.

@@ -22,6 +22,7 @@ from cvcdepth_ros.commands.arguments import (
 )
 
 if TYPE_CHECKING:
+    from cvcdepth_core.training.config import TrainingConfig
     from cvcdepth_core.training.distributed import Processes
     from cvcdepth_ros.finetuning.run import FineTuned, Order
 
@@ -67,9 +68,10 @@ def execute(arguments: argparse.Namespace) -> None:
     from cvcdepth_ros.finetuning.run import BEST_FILE
 
     refuse_unknown_checks(arguments)
+    config = _training_config(arguments.config)
     with launched_processes() as processes:
         with_report = processes.is_first and can_draw(_REPORT_FILE)
-        tuned = _fine_tuned(arguments, processes)
+        tuned = _fine_tuned(arguments, config, processes)
     if tuned is None:
         return
     result = _written(tuned, with_report)
@@ -78,11 +80,24 @@ def execute(arguments: argparse.Namespace) -> None:
         raise NotPromotedError(f"{arguments.output / BEST_FILE} is not written: {tuned.verdict.reason}")
 
 
-def _fine_tuned(arguments: argparse.Namespace, processes: "Processes") -> "FineTuned | None":
+def _training_config(path: Path) -> "TrainingConfig":
+    """Read the training file; ConfigError where it is for a data set, of which there is no reader yet."""
+    from cvcdepth_core.training.config import load_training_config
+
+    config = load_training_config(path)
+    if config.dataset != "recording":
+        raise ConfigError(
+            f"{path}: dataset is {config.dataset!r}, for which there is no reader yet; to train on recordings, write "
+            f"`dataset: recording` in this file, or in a new one below `base: {path.resolve()}`"
+        )
+    return config
+
+
+def _fine_tuned(arguments: argparse.Namespace, config: "TrainingConfig", processes: "Processes") -> "FineTuned | None":
     from cvcdepth_ros.finetuning.run import fine_tune
     from cvcdepth_ros.finetuning.tensorboard import WITHOUT_TENSORBOARD, has_tensorboard
 
-    order = _order(arguments)
+    order = _order(arguments, config)
     if processes.is_first and not has_tensorboard():
         warn(WITHOUT_TENSORBOARD)
     try:
@@ -92,19 +107,15 @@ def _fine_tuned(arguments: argparse.Namespace, processes: "Processes") -> "FineT
         raise
 
 
-def _order(arguments: argparse.Namespace) -> "Order":
+def _order(arguments: argparse.Namespace, config: "TrainingConfig") -> "Order":
     from cvcdepth_core.model_choices import checkpoint_path
     from cvcdepth_core.networks.checkpoint import load_checkpoint
     from cvcdepth_core.rig.rig_file import load_rig_layout
-    from cvcdepth_core.training.config import load_training_config
     from cvcdepth_ros.bags import find_recordings
     from cvcdepth_ros.finetuning.preparation import Source
     from cvcdepth_ros.finetuning.run import Order
     from cvcdepth_ros.settings import MatchingSettings
 
-    config = load_training_config(arguments.config)
-    if config.dataset != "recording":
-        raise ConfigError(f"{arguments.config}: dataset is {config.dataset!r}, finetune takes 'recording'")
     source = Source(
         find_recordings(arguments.recordings),
         load_rig_layout(arguments.rig) if arguments.rig else None,

@@ -1,28 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """The overlap monitor on the sample: a turned and a blurred camera are named; told by the tool that says how soon."""
 
-import importlib.util
-import sys
 from argparse import Namespace
 from typing import Any
 
 import pytest
 from recordings import SAMPLE
-from repository import ROOT
+from repository import load_tool
 
 from cvcdepth_core.rig_health.overlap_monitor import OverlapMonitor
-
-TOOL = ROOT / "tools" / "overlap_trial.py"
 
 
 @pytest.fixture(scope="module")
 def tool():
-    spec = importlib.util.spec_from_file_location("overlap_trial", TOOL)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["overlap_trial"] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules["overlap_trial"]
+    return load_tool("overlap_trial")
 
 
 @pytest.fixture(scope="module")

@@ -187,5 +187,7 @@ def test_a_checkpoint_of_an_unknown_kind_is_refused_with_the_kinds_known(spec, t
     path = tmp_path / "toy.safetensors"
     save_checkpoint(path, spec, build_depth_network(spec).state_dict())
     monkeypatch.undo()
-    with pytest.raises(CheckpointError, match=r"toy\.safetensors: spec: network is 'mean_feature': expected one of per_camera"):
+    with pytest.raises(
+        CheckpointError, match=r"toy\.safetensors: spec: network is 'mean_feature': expected one of per_camera"
+    ):
         load_checkpoint(path)

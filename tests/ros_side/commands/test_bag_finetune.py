@@ -477,6 +477,11 @@ def test_without_lidar_on_demand_the_pictures_decide(config, tmp_path):
     assert run.result["verdict"]["basis"] == "label-free"
 
 
-def test_a_configuration_for_another_dataset_is_refused(config, tmp_path, capsys):
-    assert finetune(config(dataset="ddad"), tmp_path / "run") == 1
-    assert "dataset is 'ddad', finetune takes 'recording'" in capsys.readouterr().err
+def test_a_configuration_for_a_data_set_is_refused_at_once_in_one_line_with_the_remedy(config, tmp_path, capsys):
+    path = config(dataset="ddad")
+    nowhere = ("--from", tmp_path / "gone.safetensors", "--rig", tmp_path / "gone.yaml")
+    assert finetune(path, tmp_path / "run", *nowhere, bags=(tmp_path / "gone.mcap",)) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"bag_replay: {path}: dataset is 'ddad', for which there is no reader yet")
+    assert line.endswith(f"write `dataset: recording` in this file, or in a new one below `base: {path}`")
+    assert not (tmp_path / "run").exists()

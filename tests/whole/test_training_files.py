@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every shipped training file runs on recordings: as it stands, or by the two lines that docs/training.md shows."""
+
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+import recordings
+import torch
+from repository import ROOT
+from scenes import random_batch
+
+from cvcdepth_core.training.config import load_training_config
+from cvcdepth_core.training.objective import evaluate_objective
+from cvcdepth_core.training.starting_model import build_surround_model
+from cvcdepth_ros.bag_replay import main
+
+SHIPPED = sorted((ROOT / "config" / "training").rglob("*.yaml"))
+FOR_DATA_SETS = [path for path in SHIPPED if load_training_config(path).dataset != "recording"]
+# Quick; what rows differ in beside the encoder is kept.
+SMALL = """
+depth: {encoder: efficientnet_lite0, height: 64, width: 64}
+pose: {encoder: efficientnet_lite0}
+optimizer: {epochs: 1, samples_per_step: 1}
+"""
+
+
+def on_recordings(row: Path, file: Path, more: str = "") -> Path:
+    """The file that makes a data set's settings those for recordings."""
+    file.write_text(f"base: {row}\ndataset: recording\n{more}")
+    return file
+
+
+def name(path: Path) -> str:
+    return path.stem
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=name)
+def test_a_file_is_for_recordings_or_says_what_it_is_for_and_what_to_do(path: Path):
+    marked = "there is no reader yet; on recordings: two lines, see docs/training.md" in path.read_text()
+    assert marked == (path in FOR_DATA_SETS)
+
+
+@pytest.mark.parametrize("path", FOR_DATA_SETS, ids=name)
+def test_finetune_refuses_a_data_set_in_one_line_with_file_field_value_and_remedy(
+    path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    options = ["--config", str(path), "--from-scratch", "-o", str(tmp_path / "run")]
+    assert main(["finetune", str(tmp_path / "not_looked_for.mcap"), *options]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    dataset = load_training_config(path).dataset
+    assert f"{path}: dataset is {dataset!r}" in line
+    assert f"write `dataset: recording` in this file, or in a new one below `base: {path}`" in line
+
+
+@pytest.mark.parametrize("path", FOR_DATA_SETS, ids=name)
+def test_the_two_lines_change_the_data_alone_and_the_row_can_be_learned(path: Path, tmp_path: Path):
+    row, here = load_training_config(path), load_training_config(on_recordings(path, tmp_path / "here.yaml"))
+    assert here == row.model_copy(update={"dataset": "recording"})
+    small = load_training_config(on_recordings(path, tmp_path / "small.yaml", SMALL))
+    model, batch, flips = build_surround_model(small).double(), random_batch(1, 3, 64, 64), torch.tensor([True])
+    flipped = {network: flips & (small.augmentation.flip in (network, "both")) for network in ("depth", "pose")}
+    prediction = model(batch, batch.frames, flipped["depth"], flipped["pose"])
+    evaluate_objective(batch, prediction, small.objective).loss.backward()
+    learned = [next(network.parameters()).grad for network in (model.depth_net, model.pose_net)]
+    assert all(gradient.isfinite().all() and gradient.any() for gradient in learned)
+
+
+def test_the_documented_lines_give_a_file_with_which_finetune_trains(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    page = (ROOT / "docs" / "training.md").read_text(encoding="utf-8")
+    (writing, command) = re.findall(r"^(printf .*|cvcdepth finetune .*--config here\.yaml.*)$", page, re.MULTILINE)
+    (tmp_path / "config").symlink_to(ROOT / "config")
+    monkeypatch.chdir(tmp_path)
+    subprocess.run(["bash", "-c", writing], check=True)
+    with Path("here.yaml").open("a", encoding="utf-8") as file:
+        file.write(SMALL + "recordings: {held_out: 0.0}\n")
+    recordings.write_rosbag2(tmp_path / "drives", recordings.sample_entries(4))
+    arguments = command.split()[1:]
+    assert main([*arguments, "--no-masks", "--skip", "places", "--quiet", "--device", "cpu"]) == 3
+    assert "nothing was proven: no recording has a held-out part" in capsys.readouterr().err
+    assert Path("run/last.safetensors").exists()
