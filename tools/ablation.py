@@ -24,13 +24,13 @@ import torch
 
 from cvcdepth_core.networks.checkpoint import load_checkpoint
 from cvcdepth_core.rig.rig import load_rig_layout
+from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_core.training.config import TrainingConfig, load_training_config
 from cvcdepth_core.training.run_folder import CHECKPOINT_FILE
 from cvcdepth_core.training.starting_model import build_surround_model
 from cvcdepth_core.training.trainer import Trainer
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.settings import MatchingSettings
-from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS
 from cvcdepth_ros.training_data.index import RecordingIndex, load_index
 from cvcdepth_ros.training_data.samples import RecordingBatches, first_held_out
 

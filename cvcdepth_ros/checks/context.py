@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from cvcdepth_core.errors import ImageError, RecordingError, RigError, TransformError
 from cvcdepth_core.images.decoding import Picture
 from cvcdepth_core.rig.rig import Rig, RigLayout
+from cvcdepth_core.stamps import exposure_times
 from cvcdepth_ros.bags import RecordedMessage, Recording
 from cvcdepth_ros.messages.conversion import picture_from_message
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
@@ -131,7 +132,7 @@ class CheckContext:
         """Return when a camera's images were taken [M], ns, sorted: their stamps without the camera's offset."""
         entries = self.assembler.layout.cameras if self.assembler else ()
         offsets = {entry.name: entry.stamp_offset_ns for entry in entries}
-        return self.stamps(camera) - offsets[camera]
+        return exposure_times(self.stamps(camera), offsets[camera])
 
     def match(
         self, layout: RigLayout, tolerance: float, changed_offsets: Mapping[str, float] | None = None

@@ -13,11 +13,11 @@ from cvcdepth_core.errors import RecordingError, RigError, TransformError
 from cvcdepth_core.images.rectifier import Rectifier, self_occlusion_mask
 from cvcdepth_core.rig.rig import Camera, Rig
 from cvcdepth_core.scoring.ground_truth import PinholeView
+from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_ros.checks.context import CheckContext, CheckResult, Status
 from cvcdepth_ros.messages.conversion import stamp_ns
 from cvcdepth_ros.messages.transforms import TransformTree
 from cvcdepth_ros.recordings.lidar import LidarSweeps, cloud_topics, told_of_cameras
-from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS
 
 _NEEDS_RIG = CheckResult("skipped", "needs all cameras with calibration and transform")
 _MOSTLY_MASKED = 0.6

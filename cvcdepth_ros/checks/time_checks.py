@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from cvcdepth_core.rig.rig import RigLayout
+from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_ros.checks.context import CheckContext, CheckResult, Status
 from cvcdepth_ros.recordings.topic_timing import Timing
-from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS, SurroundSet
+from cvcdepth_ros.surround_sets.synchronizer import SurroundSet
 
 _FEW_STEPS_BACK = 0.01
 _ENOUGH_SETS = 0.9

@@ -20,6 +20,7 @@ from cvcdepth_core.rig.poses import Pose
 from cvcdepth_core.scoring.consistency import AgreementTable, PosedDepth, spatial_rows, temporal_rows
 from cvcdepth_core.scoring.ground_truth import PinholeView, SparseDepth, overlap_pixels, sample_prediction
 from cvcdepth_core.scoring.scores import DepthSamples, Scores, SurroundScorer
+from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_core.visualization import Points
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.evaluation.job import EvaluationJob
@@ -27,7 +28,6 @@ from cvcdepth_ros.recordings.replay import DepthReplay, EstimatedSet, SurroundRe
 from cvcdepth_ros.recordings.rig import discover_rig
 from cvcdepth_ros.recordings.truth import RecordedTruth
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
-from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS
 
 Progress = Callable[[float], None]
 """Told which share of the recording is done."""

@@ -17,11 +17,11 @@ import torch
 from cvcdepth_core.errors import CvcDepthError
 from cvcdepth_core.files import write_atomically, write_json
 from cvcdepth_core.networks.checkpoint import load_checkpoint
+from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_ros.bags import file_identities
 from cvcdepth_ros.evaluation.result import EvaluationResult
 from cvcdepth_ros.finetuning.judgement import camera_numbers, known, numbers_of
 from cvcdepth_ros.finetuning.run import FineTuned
-from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS
 from cvcdepth_ros.training_data.index import RecordingIndex
 from cvcdepth_ros.version import package_version
 

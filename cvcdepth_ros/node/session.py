@@ -12,6 +12,7 @@ from cvcdepth_core.errors import CvcDepthError
 from cvcdepth_core.estimator import DepthEstimator
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.rig_health.overlap_monitor import OverlapMonitor
+from cvcdepth_core.stamps import NANOSECONDS, exposure_times
 from cvcdepth_ros.live.camera_states import CameraCondition, CameraState, CameraWatch, Trouble, condition
 from cvcdepth_ros.live.mailbox import Mailbox
 from cvcdepth_ros.live.picture_preparation import CameraImage
@@ -29,7 +30,7 @@ from cvcdepth_ros.node.parameters import NodeParameters, read_parameters
 from cvcdepth_ros.node.publishers import SurroundOutputs
 from cvcdepth_ros.node.subscriptions import CameraInputs, StaticTransformInput
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
-from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS, SurroundSynchronizer
+from cvcdepth_ros.surround_sets.synchronizer import SurroundSynchronizer
 from cvcdepth_ros.surround_sets.trace_file import TraceFile
 
 
@@ -159,7 +160,7 @@ class SurroundSession:
         self._is_finished = self._pipeline.close()
 
     def _on_image(self, camera: str, message: Any) -> None:
-        taken = stamp_ns(message) - self._offsets_ns[camera]
+        taken = exposure_times(stamp_ns(message), self._offsets_ns[camera])
         self.latencies.record("receive (ROS time)", (self._ros_time() - taken) / NANOSECONDS)
         megabytes = len(message.data) / 1e6
         if megabytes > self._max_image_mb:

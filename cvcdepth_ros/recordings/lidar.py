@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from cvcdepth_core.errors import ConfigError, RecordingError, TransformError
 from cvcdepth_core.rig.poses import Pose, inverse, pose_from_quaternion
+from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_ros.bags import RecordedMessage, Recording
 from cvcdepth_ros.messages.conversion import stamp_ns
 from cvcdepth_ros.messages.transforms import PoseTrack, TransformTree, frame_name
 from cvcdepth_ros.recordings.fixed_frames import MOVING_TRANSFORMS
-from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS
 
 CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
 ODOMETRY_TYPE = "nav_msgs/msg/Odometry"

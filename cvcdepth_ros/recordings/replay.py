@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from cvcdepth_core.errors import CvcDepthError, RecordingError, RigError
 from cvcdepth_core.estimator import DepthPredictor, SurroundDepth, SurroundDepthEstimator
 from cvcdepth_core.rig.rig import Rig, RigLayout
+from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_ros.bags import RecordedMessage, Recording
 from cvcdepth_ros.messages.conversion import stamp_ns
 from cvcdepth_ros.messages.transforms import TransformTree
@@ -26,7 +27,6 @@ from cvcdepth_ros.settings import MatchingSettings
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
 from cvcdepth_ros.surround_sets.set_estimation import estimate_set
 from cvcdepth_ros.surround_sets.synchronizer import (
-    NANOSECONDS,
     SurroundSet,
     SurroundSynchronizer,
     SynchronizerStatistics,

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.typesys.store import Typestore
 
+from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_ros.bags import RecordedMessage
-from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS
 
 _GAP = 2.0  # times the median interval
 _HEADER = "std_msgs/msg/Header"

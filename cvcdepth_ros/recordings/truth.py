@@ -11,11 +11,11 @@ from cvcdepth_core.errors import CvcDepthError, RecordingError, TransformError
 from cvcdepth_core.rig.poses import Pose
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.scoring.ground_truth import OcclusionFilter, PinholeView, SparseDepth, sparse_depth
+from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_core.visualization import Points
 from cvcdepth_ros.bags import RecordedMessage
 from cvcdepth_ros.recordings.lidar import CLOUD_TYPE, LidarSweeps, VehicleMotion, cloud_topics, find_lidars
 from cvcdepth_ros.recordings.replay import Refusals, SurroundReplay
-from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS
 
 _LATE_NS = 300_000_000
 """By how much later than its stamp a sweep or a pose is recorded, at most."""

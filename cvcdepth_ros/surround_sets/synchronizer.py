@@ -48,13 +48,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 from cvcdepth_core.errors import ConfigError
+from cvcdepth_core.stamps import exposure_times, to_nanoseconds
 
 if TYPE_CHECKING:
     from cvcdepth_core.rig.rig import RigLayout
 
 T = TypeVar("T")
 
-NANOSECONDS = 1_000_000_000
 _INTERVALS_FOR_PERIOD = 9
 _BEHIND_IN_A_ROW = 3
 _PATIENCE_PERIODS = 3
@@ -128,11 +128,11 @@ class SurroundSynchronizer(Generic[T]):
             )
         self.required = min_cameras or len(cameras)
         """Images without which no set leaves."""
-        self._tolerance = _to_nanoseconds("tolerance", tolerance, minimum=0.0)
-        clock_jump_ns = _to_nanoseconds("clock_jump", clock_jump, minimum=tolerance)
+        self._tolerance = _checked_nanoseconds("tolerance", tolerance, minimum=0.0)
+        clock_jump_ns = _checked_nanoseconds("clock_jump", clock_jump, minimum=tolerance)
         self._streams: dict[str, _Stream[T]] = {}
         for camera in cameras:
-            offset = _to_nanoseconds(f"offsets[{camera!r}]", (offsets or {}).get(camera, 0.0))
+            offset = _checked_nanoseconds(f"offsets[{camera!r}]", (offsets or {}).get(camera, 0.0))
             self._streams[camera] = _Stream(offset, queue_size, clock_jump_ns)
         self._anchor = anchor
         self._acting_anchor = anchor
@@ -159,7 +159,7 @@ class SurroundSynchronizer(Generic[T]):
             raise ConfigError(f"camera: {camera!r} is not one of {', '.join(self._streams)}")
         with self._lock:
             self._arrivals += 1
-            stream.accept(stamp_ns - stream.offset, image, self._arrivals)
+            stream.accept(exposure_times(stamp_ns, stream.offset), image, self._arrivals)
             return self._decide(final=False)
 
     def flush(self) -> list[SurroundSet[T]]:
@@ -411,9 +411,9 @@ def _check_cameras(cameras: Sequence[str], anchor: str, offsets: Mapping[str, fl
         raise ConfigError(f"offsets: {', '.join(unknown)} not among the cameras {', '.join(cameras)}")
 
 
-def _to_nanoseconds(field: str, seconds: float, minimum: float = -math.inf) -> int:
+def _checked_nanoseconds(field: str, seconds: float, minimum: float = -math.inf) -> int:
     number = isinstance(seconds, int | float) and not isinstance(seconds, bool)
     if not number or not math.isfinite(seconds) or seconds < minimum:
         bound = "" if math.isinf(minimum) else f" of at least {minimum}"
         raise ConfigError(f"{field}: expected a number of seconds{bound}, found {seconds!r}")
-    return round(seconds * NANOSECONDS)
+    return to_nanoseconds(seconds)

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from cvcdepth_core.errors import CvcDepthError, ImageError, RecordingError, RigError, TransformError
 from cvcdepth_core.files import write_atomically
 from cvcdepth_core.rig.rig import RigLayout
+from cvcdepth_core.stamps import exposure_times
 from cvcdepth_ros.bags import Location, RecordedMessage, Recording, file_identities, open_recording
 from cvcdepth_ros.messages.conversion import picture_from_message
 from cvcdepth_ros.recordings.lidar import VehicleMotion
@@ -58,8 +59,7 @@ class RecordingIndex:
     def times(self) -> NDArray[np.int64]:
         """[S, N] when each image was taken, ns: its stamp without its camera's offset."""
         offsets = np.array([camera.stamp_offset_ns for camera in self.layout.cameras], dtype=np.int64)
-        times: NDArray[np.int64] = self.stamps - offsets
-        return times
+        return exposure_times(self.stamps, offsets)
 
     @property
     def losses(self) -> list[str]:

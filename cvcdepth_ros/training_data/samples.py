@@ -26,12 +26,12 @@ from cvcdepth_core.images.decoding import Picture
 from cvcdepth_core.images.rectifier import SurroundPreprocessor
 from cvcdepth_core.networks.pose import MAX_TRANSLATION
 from cvcdepth_core.rig.poses import inverse
+from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_core.training.batch import RigBatch
 from cvcdepth_core.training.config import RecordingsConfig, TrainingConfig
 from cvcdepth_core.training.distributed import ALONE, Processes
 from cvcdepth_ros.bags import Recording, open_recording
 from cvcdepth_ros.messages.conversion import picture_from_message, stamp_ns
-from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS
 from cvcdepth_ros.training_data.index import RecordingIndex
 
 Part = Literal["training", "held_out"]
