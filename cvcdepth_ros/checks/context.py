@@ -19,8 +19,10 @@ from cvcdepth_core.stamps import exposure_times
 from cvcdepth_ros.bags import RecordedMessage, Recording
 from cvcdepth_ros.messages.conversion import picture_from_message
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
-from cvcdepth_ros.recordings.lidar import VehicleMotion, find_lidars
-from cvcdepth_ros.recordings.rig import IMAGE_TYPES, collect_rig, discover_layout
+from cvcdepth_ros.recordings.motion import VehicleMotion, find_motion_link
+from cvcdepth_ros.recordings.refusals import Refusals
+from cvcdepth_ros.recordings.rig import IMAGE_TYPES, chosen_layout
+from cvcdepth_ros.recordings.rig_messages import RigMessages
 from cvcdepth_ros.recordings.topic_timing import TopicTiming
 from cvcdepth_ros.surround_sets.synchronizer import SurroundSet, SurroundSynchronizer
 
@@ -55,7 +57,7 @@ class CheckOptions:
     base_frame: str = "base_link"
     """The vehicle's frame where no rig file names it."""
     lidar: tuple[str, ...] | None = None
-    """LiDAR topics; None for all of the recording, see `find_lidars`."""
+    """LiDAR topics; None for all of the recording, see `RigMessages.lidars`."""
     start: int | None = None
     """First log time to read, ns."""
     stop: int | None = None
@@ -88,12 +90,17 @@ class CheckContext:
         """Why the recorded transforms make no tree."""
         self.refusal: str | None = None
         """Why the cameras make no rig at all."""
-        self.assembler = self._collected(rig_layout)
+        layout = self._chosen_layout(rig_layout)
+        messages = RigMessages(recording, layout)
+        self.assembler = None if layout is None else self._assembled(messages, layout)
         """None where the cameras make no rig, or the transforms contradict each other."""
-        self.lidars, self.clouds_of_cameras = find_lidars(recording) if options.lidar is None else (options.lidar, ())
+        self.lidars = messages.lidars if options.lidar is None else options.lidar
+        """The topics of the LiDARs."""
+        self.camera_clouds = messages.camera_clouds if options.lidar is None else ()
+        """Topics with clouds that were made of pictures, of the cameras that are no LiDARs."""
         self.motion = self._found_motion()
-        self.motion_problem: str | None = None
-        """The first impossible pose."""
+        self.refused_motion = Refusals()
+        """Impossible poses."""
         self.timings: dict[str, TopicTiming] = {}
         """Of the topics with images and LiDAR sweeps."""
         self.images: list[ImageTimes] = []
@@ -145,8 +152,12 @@ class CheckContext:
         sets = [found for image in self.images for found in synchroniser.add(*image)]
         return sets + synchroniser.flush()
 
-    def shown_sets(self) -> Iterator[dict[str, Picture]]:
-        """Decode a few sets, spread over the recording; pictures that cannot be decoded are left out."""
+    @cached_property
+    def shown_sets(self) -> list[dict[str, Picture]]:
+        """The pictures of a few sets, spread over the recording; those that cannot be decoded are left out."""
+        return [*self._decoded_sets()]
+
+    def _decoded_sets(self) -> Iterator[dict[str, Picture]]:
         if self.layout is None:
             return
         sets = self.match(self.layout, self.options.tolerance)
@@ -161,10 +172,16 @@ class CheckContext:
             pictures = {camera: self._picture(camera, message) for camera, message in read.items()}
             yield {camera: picture for camera, picture in pictures.items() if not isinstance(picture, str)}
 
-    def _collected(self, layout: RigLayout | None) -> RigAssembler | None:
+    def _chosen_layout(self, rig_file: RigLayout | None) -> RigLayout | None:
         try:
-            layout = layout or discover_layout(self.recording, self.options.base_frame)
-            return collect_rig(self.recording, layout)
+            return chosen_layout(self.recording, rig_file, self.options.base_frame)
+        except RecordingError as error:
+            self.refusal = str(error)
+            return None
+
+    def _assembled(self, messages: RigMessages, layout: RigLayout) -> RigAssembler | None:
+        try:
+            return messages.assembler(layout)
         except TransformError as error:
             self.contradiction = str(error)
         except (RecordingError, RigError) as error:
@@ -174,7 +191,8 @@ class CheckContext:
     def _found_motion(self) -> VehicleMotion | None:
         if self.assembler is None:
             return None
-        return VehicleMotion.find(self.recording, self.assembler.layout.base_frame, self.assembler.transforms)
+        link = find_motion_link(self.recording, self.assembler.layout.base_frame, self.assembler.transforms)
+        return None if link is None else VehicleMotion(link)
 
     def _read(self, progress: Callable[[int], None] | None) -> None:
         cameras = self._cameras_by_topic()
@@ -210,11 +228,9 @@ class CheckContext:
             self.sweeps[message.topic].append(self._deserialized(message))
 
     def _add_motion(self, message: RecordedMessage) -> None:
-        try:
+        with self.refused_motion.instead_of_errors():
             if self.motion is not None:
                 self.motion.add(self.recording.deserialize(message))
-        except (RecordingError, TransformError) as error:
-            self.motion_problem = self.motion_problem or str(error)
 
     def _deserialized(self, message: RecordedMessage) -> Any:
         try:

@@ -21,7 +21,7 @@ _MUCH_BETTER = 0.85  # of the error; in right rigs the best exchange has about 1
 
 def check_brightness(context: CheckContext) -> CheckResult:
     """Look for cameras whose pictures are black, or of one colour: a lens cap, a dead sensor, a night without light."""
-    shown = list(context.shown_sets())
+    shown = context.shown_sets
     if not shown:
         return CheckResult("skipped", "needs a set of pictures")
     empty = {camera: sum(_shows_nothing(found[camera]) for found in shown if camera in found) for camera in shown[0]}
@@ -59,7 +59,7 @@ def _placed_pictures(context: CheckContext, rig: Rig) -> PlacedPictures | None:
     preprocessor = SurroundPreprocessor(rig, _HEIGHT, _WIDTH)
     sets = [
         np.stack([preprocessor.rectify(index, found[name]) for index, name in enumerate(rig.names)])
-        for found in context.shown_sets()
+        for found in context.shown_sets
         if len(found) == len(rig.names)
     ]
     if not sets:

@@ -11,12 +11,12 @@ from cvcdepth_ros.messages.transforms import frame_name
 from cvcdepth_ros.recordings.fixed_frames import MOVING_TRANSFORMS
 from cvcdepth_ros.recordings.rig import (
     IMAGE_TYPES,
-    STATIC_TRANSFORMS,
     is_of_depth,
     recorded_cameras,
     topic_problems,
     topics_without_images,
 )
+from cvcdepth_ros.recordings.rig_messages import STATIC_TRANSFORMS
 
 _INFO = "camera_info"
 _TOLD = 2

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from pydantic import Field, model_validator
 
-from cvcdepth_ros.settings import MatchingSettings, ModelSettings
+from cvcdepth_ros.settings import LIDAR_TOLERANCE, MatchingSettings, ModelSettings
 from cvcdepth_ros.version import package_version
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ class EvaluationSettings(MatchingSettings, ModelSettings):
     """Metres; truth at or below it is left out, predictions are clamped to it."""
     max_depth: float = Field(80.0, gt=0, le=1e4)
     """Metres; truth at or beyond it is left out, predictions are clamped to it, and label-free scores stop there."""
-    lidar_tolerance: float = Field(0.1, ge=0, le=10)
+    lidar_tolerance: float = Field(LIDAR_TOLERANCE, ge=0, le=10)
     """Seconds that a LiDAR sweep may be from the image that it is the truth of."""
     no_occlusion_filter: bool = False
     """Take every LiDAR point for truth, also those that the camera cannot see behind a nearer surface."""
@@ -111,7 +111,7 @@ class EvaluationJob:
     base_frame: str = "base_link"
     """The vehicle's frame, where `layout` is None."""
     lidar: tuple[str, ...] | None = None
-    """Topics of the LiDARs; none: the vehicle has none; None: all of the recording, see `find_lidars`."""
+    """Topics of the LiDARs; none: the vehicle has none; None: all of the recording, see `RecordedRig.lidars`."""
     start: float = 0.0
     """Seconds of the recording to skip."""
     duration: float | None = None

@@ -24,10 +24,11 @@ from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_core.visualization import Points
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.evaluation.job import EvaluationJob
-from cvcdepth_ros.recordings.replay import DepthReplay, EstimatedSet, SurroundReplay
-from cvcdepth_ros.recordings.rig import discover_rig
+from cvcdepth_ros.recordings.replay import DepthReplay, RecordedImage, SurroundReplay
+from cvcdepth_ros.recordings.rig import RecordedRig
 from cvcdepth_ros.recordings.truth import RecordedTruth
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
+from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet
 
 Progress = Callable[[float], None]
 """Told which share of the recording is done."""
@@ -39,7 +40,7 @@ _LONGEST_STEP_NS = NANOSECONDS  # between two sets that are compared along the v
 class MeasuredSet:
     """One set's depth and what the recording tells of the truth."""
 
-    estimated: EstimatedSet
+    estimated: EstimatedSet[RecordedImage]
     truth: Sequence[SparseDepth]
     """Of each camera, in the rig's order, at its picture's full size; empty where there is none."""
     world_T_base: Sequence[Pose] | None
@@ -50,7 +51,7 @@ class MeasuredSet:
     @property
     def stamp_ns(self) -> int:
         """The anchor's stamp."""
-        return self.estimated.images.stamp_ns
+        return self.estimated.surround_set.stamp_ns
 
     @property
     def log_time(self) -> int:
@@ -60,11 +61,11 @@ class MeasuredSet:
     @property
     def posed(self) -> PosedDepth:
         """The depth with the cameras' places."""
-        return PosedDepth.of(self.estimated.depth, self.estimated.rig, self.world_T_base)
+        return PosedDepth.of(self.estimated.result, self.estimated.rig, self.world_T_base)
 
     def samples(self) -> list[DepthSamples]:
         """Return what is scored of each camera."""
-        rig, depth = self.estimated.rig, self.estimated.depth.depth
+        rig, depth = self.estimated.rig, self.estimated.result.depth
         views = {camera.name: PinholeView.of(camera) for camera in rig.cameras}
         found = []
         for name, truth, prediction in zip(rig.names, self.truth, depth, strict=True):
@@ -114,11 +115,11 @@ class RecordingScores:
 class RecordingEvaluation:
     """One opened recording, ready to be measured; make it with `open_evaluation`."""
 
-    def __init__(self, job: EvaluationJob, replay: SurroundReplay) -> None:
+    def __init__(self, job: EvaluationJob, recorded: RecordedRig) -> None:
         self.job = job
-        self.replay = replay
-        self.truth = RecordedTruth(replay, job.lidar, job.settings.lidar_tolerance)
-        self.depths = DepthReplay(replay, job.settings.build_predictor(replay.rig))
+        self.replay = SurroundReplay(recorded, job.settings)
+        self.truth = RecordedTruth(recorded, job.lidar, job.settings.lidar_tolerance)
+        self.depths = DepthReplay(self.replay, job.settings.build_predictor(self.replay.rig))
 
     @property
     def window(self) -> tuple[int, int]:
@@ -131,7 +132,7 @@ class RecordingEvaluation:
         """Give the sets of start <= log_time < stop (ns), in order; with a stamp, the set of that stamp only."""
         ahead = self.truth.ahead_ns
         self.truth.read(start - ahead, start)
-        pending: deque[EstimatedSet] = deque()
+        pending: deque[EstimatedSet[RecordedImage]] = deque()
         for estimated in self.depths.sets(start, stop, self.truth.handlers, stamp_ns):
             pending.append(estimated)
             while _log_time(pending[0]) + ahead < _log_time(estimated):
@@ -156,13 +157,13 @@ class RecordingEvaluation:
         """Where the time went."""
         return self.depths.latencies
 
-    def _measured(self, estimated: EstimatedSet) -> MeasuredSet:
-        images, rig = estimated.images, estimated.rig
+    def _measured(self, estimated: EstimatedSet[RecordedImage]) -> MeasuredSet:
+        surround_set, rig = estimated.surround_set, estimated.rig
         with self.latencies.measure("truth"):
-            truth = self.truth.camera_depth(rig, images.times_ns, self.job.settings.occlusion)
-            poses = self.truth.base_poses(rig, images.times_ns)
-            lidar = self.truth.points(images.time_ns)
-            self.truth.forget_before(min(images.times_ns.values()))
+            truth = self.truth.camera_depth(rig, surround_set.times_ns, self.job.settings.occlusion)
+            poses = self.truth.base_poses(rig, surround_set.times_ns)
+            lidar = self.truth.points(surround_set.time_ns)
+            self.truth.forget_before(min(surround_set.times_ns.values()))
         return MeasuredSet(estimated, truth, poses, lidar)
 
 
@@ -176,8 +177,7 @@ def open_evaluation(job: EvaluationJob) -> Iterator[RecordingEvaluation]:
     torch.set_num_threads(job.settings.threads)
     try:
         with open_recording(job.path) as recording:
-            layout = job.layout or discover_rig(recording, job.base_frame)
-            yield RecordingEvaluation(job, SurroundReplay(recording, layout, job.settings))
+            yield RecordingEvaluation(job, RecordedRig.from_recording(recording, job.layout, job.base_frame))
     finally:
         torch.set_num_threads(threads)
 
@@ -268,5 +268,5 @@ def _summary(evaluation: RecordingEvaluation, scoring: _Scoring) -> dict[str, An
     }
 
 
-def _log_time(estimated: EstimatedSet) -> int:
-    return max(image.log_time for image in estimated.images.images.values())
+def _log_time(estimated: EstimatedSet[RecordedImage]) -> int:
+    return max(image.log_time for image in estimated.surround_set.images.values())

@@ -8,7 +8,6 @@ there is no clock to keep up with, hence no mailbox.
 import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from itertools import islice
 from typing import Any, NamedTuple
 
@@ -16,16 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvcdepth_core.errors import CvcDepthError, RecordingError, RigError
-from cvcdepth_core.estimator import DepthPredictor, SurroundDepth, SurroundDepthEstimator
-from cvcdepth_core.rig.rig import Rig, RigLayout
-from cvcdepth_core.stamps import NANOSECONDS
-from cvcdepth_ros.bags import RecordedMessage, Recording
+from cvcdepth_core.estimator import DepthPredictor, SurroundDepthEstimator
+from cvcdepth_core.rig.rig import Rig
+from cvcdepth_core.stamps import NANOSECONDS, exposure_times
+from cvcdepth_ros.bags import RecordedMessage
 from cvcdepth_ros.messages.conversion import stamp_ns
-from cvcdepth_ros.messages.transforms import TransformTree
-from cvcdepth_ros.recordings.rig import add_camera_info, assemble_rig
+from cvcdepth_ros.recordings.refusals import Refusals
+from cvcdepth_ros.recordings.rig import RecordedRig
+from cvcdepth_ros.recordings.rig_messages import add_camera_info
 from cvcdepth_ros.settings import MatchingSettings
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
-from cvcdepth_ros.surround_sets.set_estimation import estimate_set
+from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet, estimate_set
 from cvcdepth_ros.surround_sets.synchronizer import (
     SurroundSet,
     SurroundSynchronizer,
@@ -34,7 +34,6 @@ from cvcdepth_ros.surround_sets.synchronizer import (
 
 Handlers = Mapping[str, Callable[[RecordedMessage], None]]
 
-_KEPT_REASONS = 100
 _IMAGES_TO_EXPLAIN = 1000
 
 
@@ -45,42 +44,24 @@ class RecordedImage(NamedTuple):
     log_time: int
 
 
-class Refusals:
-    """Messages and sets that could not be used: how many, and the first hundred reasons."""
-
-    def __init__(self) -> None:
-        self.count = 0
-        self.reasons: list[str] = []
-
-    def add(self, reason: str) -> None:
-        """Count one more."""
-        self.count += 1
-        if len(self.reasons) < _KEPT_REASONS:
-            self.reasons.append(reason)
-
-    def __str__(self) -> str:
-        return f"{self.count} refused, the first: {self.reasons[0]}" if self.count else "none refused"
-
-
 class SurroundReplay:
     """The surround sets of a recording, matched as the live node would match them."""
 
-    def __init__(
-        self, recording: Recording, layout: RigLayout, matching: MatchingSettings, min_cameras: int = 0
-    ) -> None:
-        """Complete the rig; RecordingError, RigError or TransformError names the first thing that is missing.
+    def __init__(self, recorded: RecordedRig, matching: MatchingSettings, min_cameras: int = 0) -> None:
+        """Match the images of a rig's recording.
 
         `min_cameras` below the rig's number gives sets that lack the images of dead cameras; 0 gives only whole ones.
         """
-        self.recording = recording
-        self.layout = layout
+        self.recorded = recorded
+        self.recording = recorded.recording
+        self.layout = recorded.layout
         self.unreadable = Refusals()
         """Images and CameraInfo whose bytes are no such message."""
-        self._assembler = assemble_rig(recording, layout)
+        self._assembler = recorded.assembler()
         self._rig: Rig | RigError = self._assembler.rig()
         self._tolerance = matching.tolerance
-        self._synchroniser: SurroundSynchronizer[RecordedImage] = SurroundSynchronizer.of_rig(
-            layout, matching.tolerance, matching.queue_size, min_cameras
+        self._synchroniser: SurroundSynchronizer[RecordedImage] = SurroundSynchronizer.from_layout(
+            self.layout, matching.tolerance, matching.queue_size, min_cameras
         )
 
     @property
@@ -99,11 +80,6 @@ class SurroundReplay:
     def frame_ids(self) -> dict[str, str]:
         """Each camera's optical frame."""
         return {name: self._assembler.frame_id(name) or "" for name in self.layout.names}
-
-    @property
-    def transforms(self) -> TransformTree:
-        """The fixed transforms of the recording."""
-        return self._assembler.transforms
 
     @property
     def statistics(self) -> SynchronizerStatistics:
@@ -148,8 +124,8 @@ class SurroundReplay:
         for message in islice(self.recording.messages(cameras, start, stop), _IMAGES_TO_EXPLAIN):
             camera = cameras[message.topic]
             with suppress(RecordingError):
-                stamp = stamp_ns(self.recording.deserialize(message)) / NANOSECONDS
-                stamps[camera.name].append(stamp - camera.stamp_offset)
+                stamp = stamp_ns(self.recording.deserialize(message))
+                stamps[camera.name].append(exposure_times(stamp, camera.stamp_offset_ns) / NANOSECONDS)
         anchor = np.array(stamps[self.layout.anchor_camera])
         return {name: _median_distance(anchor, np.array(found)) for name, found in stamps.items()}
 
@@ -174,15 +150,6 @@ class SurroundReplay:
                 self._rig = error
 
 
-@dataclass(frozen=True, eq=False)
-class EstimatedSet:
-    """One set with its depth."""
-
-    images: SurroundSet[RecordedImage]
-    rig: Rig
-    depth: SurroundDepth
-
-
 class DepthReplay:
     """Estimates every set of a replay. A set that cannot be estimated is left out and told in `refused`."""
 
@@ -202,7 +169,7 @@ class DepthReplay:
         stop: int | None = None,
         handlers: Handlers | None = None,
         stamp_ns: int | None = None,
-    ) -> Iterator[EstimatedSet]:
+    ) -> Iterator[EstimatedSet[RecordedImage]]:
         """Give the sets of `SurroundReplay.sets` with their depth; with a stamp, the set of that stamp only."""
         for images in self._replay.sets(start, stop, handlers):
             if stamp_ns not in (None, images.stamp_ns):

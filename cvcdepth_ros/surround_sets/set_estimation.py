@@ -2,17 +2,33 @@
 """From the image messages of one set to depth, for the bag tool and the evaluation, and the live node's part of it."""
 
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
 
 from cvcdepth_core.errors import ImageError
 from cvcdepth_core.estimator import SurroundDepth, SurroundDepthEstimator
 from cvcdepth_core.images.decoding import Picture
 from cvcdepth_core.images.rectifier import Rectifier
+from cvcdepth_core.rig.rig import Rig
 from cvcdepth_ros.messages.conversion import picture_from_message
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
+from cvcdepth_ros.surround_sets.synchronizer import SurroundSet
+
+T = TypeVar("T")
 
 Outcome = Picture | ImageError
 """What became of an image: the network's picture, or why there is none."""
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatedSet(Generic[T]):
+    """A surround set with its depth, and the rig by which both are to be understood."""
+
+    surround_set: SurroundSet[T]
+    rig: Rig
+    """As it was at this set: calibrations may change meanwhile."""
+    result: SurroundDepth
+    """Arrays in the order of the rig's cameras."""
 
 
 def estimate_set(

@@ -142,7 +142,7 @@ class SurroundSynchronizer(Generic[T]):
         self._lock = threading.Lock()
 
     @classmethod
-    def of_rig(
+    def from_layout(
         cls, layout: "RigLayout", tolerance: float, queue_size: int = 10, min_cameras: int = 0
     ) -> "SurroundSynchronizer[T]":
         """Match the cameras of a rig with its anchor and its stamp offsets; the rest as in the constructor."""

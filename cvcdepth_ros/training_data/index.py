@@ -19,15 +19,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cvcdepth_core.errors import CvcDepthError, ImageError, RecordingError, RigError, TransformError
+from cvcdepth_core.errors import ImageError, RecordingError, RigError, TransformError
 from cvcdepth_core.files import write_atomically
 from cvcdepth_core.rig.rig import RigLayout
 from cvcdepth_core.stamps import exposure_times
-from cvcdepth_ros.bags import Location, RecordedMessage, Recording, file_identities, open_recording
+from cvcdepth_ros.bags import Location, Recording, file_identities, open_recording
 from cvcdepth_ros.messages.conversion import picture_from_message
-from cvcdepth_ros.recordings.lidar import VehicleMotion
-from cvcdepth_ros.recordings.replay import RecordedImage, Refusals, SurroundReplay
-from cvcdepth_ros.recordings.rig import assemble_rig, discover_rig, topics_without_images
+from cvcdepth_ros.recordings.motion import VehicleMotion
+from cvcdepth_ros.recordings.refusals import Refusals
+from cvcdepth_ros.recordings.replay import RecordedImage, SurroundReplay
+from cvcdepth_ros.recordings.rig import RecordedRig, topics_without_images
+from cvcdepth_ros.recordings.truth import RecordedTruth
 from cvcdepth_ros.settings import MatchingSettings
 from cvcdepth_ros.surround_sets.synchronizer import SurroundSet
 
@@ -95,16 +97,24 @@ def load_index(
 
 
 def build_index(path: Location, matching: MatchingSettings, rig_layout: RigLayout | None = None) -> RecordingIndex:
-    """Read the whole recording once; see `load_index`."""
+    """Return the index of the recording at `path`, read anew; see `load_index`."""
     with open_recording(path) as recording:
-        layout = _complete_layout(recording, rig_layout)
-        replay = SurroundReplay(recording, layout, matching)
-        motion = VehicleMotion.find(recording, layout.base_frame, replay.transforms)
-        refused = Refusals()
-        sets, thumbnails = _collect(recording, replay, motion, refused)
-        if not sets:
-            raise RecordingError(f"{path}: no surround set: {replay.why_no_set()}")
-        unread = tuple(_unread(recording, replay, refused, len(sets)))
+        if rig_layout is None:
+            _refuse_blind_cameras(recording)
+            return index_recording(RecordedRig.from_recording(recording), matching)
+        return index_recording(RecordedRig.from_recording(recording, rig_layout).completed(), matching)
+
+
+def index_recording(recorded: RecordedRig, matching: MatchingSettings) -> RecordingIndex:
+    """Return the index of a rig's recording, which is read through; see `load_index` for the errors."""
+    path, layout = recorded.recording.path, recorded.layout
+    _refuse_lonely_cameras(recorded)
+    replay = SurroundReplay(recorded, matching)
+    truth = RecordedTruth(recorded, lidar=())
+    motion = truth.motion
+    sets, thumbnails = _collect(replay, truth)
+    if not sets:
+        raise RecordingError(f"{path}: no surround set: {replay.why_no_set()}")
     poses = None if motion is None else [_poses(motion, surround_set) for surround_set in sets]
     placed = [i for i in range(len(sets)) if poses is None or poses[i] is not None]
     if not placed:
@@ -117,33 +127,27 @@ def build_index(path: Location, matching: MatchingSettings, rig_layout: RigLayou
         poses=None if poses is None else np.array([poses[i] for i in placed]).reshape(-1, len(layout.names), 4, 4),
         thumbnails=np.stack(thumbnails) if motion is None else None,
         unplaced=len(sets) - len(placed),
-        unread=unread,
+        unread=tuple(_unread(replay, truth.refused, len(sets))),
     )
 
 
-def _unread(recording: Recording, replay: SurroundReplay, refused: Refusals, sets: int) -> Iterator[str]:
-    """Say what of a recording that was read to its end, and gave so many sets, could not be read or used."""
-    if recording.damage:
-        yield f"not everything could be read: {recording.damage}"
+def _unread(replay: SurroundReplay, refused: Refusals, sets: int) -> Iterator[str]:
+    """Give what of a recording that was read to its end, and gave so many sets, could not be read or used."""
+    if replay.recording.damage:
+        yield f"not everything could be read: {replay.recording.damage}"
     yield from (str(found) for found in (replay.unreadable, refused) if found.count)
     if undecodable := replay.statistics.sets - sets:
         yield f"{undecodable} sets are left out: no picture of camera {replay.layout.anchor_camera} could be decoded"
 
 
-def _complete_layout(recording: Recording, layout: RigLayout | None) -> RigLayout:
-    if layout is not None:
-        complete = assemble_rig(recording, layout).completed_layout()
-    else:
-        _refuse_blind_cameras(recording)
-        complete = discover_rig(recording)
-    neighbours = complete.complete().neighbours
+def _refuse_lonely_cameras(recorded: RecordedRig) -> None:
+    neighbours = recorded.layout.complete().neighbours
     lonely = [name for name, others in neighbours.items() if not others]
     if lonely:
         raise RigError(
-            f"{recording.path}: camera {', '.join(lonely)}: shares no view with another camera, so there is no overlap "
-            "to learn metric depth from; `bag_replay rig` shows the overlaps"
+            f"{recorded.recording.path}: camera {', '.join(lonely)}: shares no view with another camera, so there is "
+            "no overlap to learn metric depth from; `bag_replay rig` shows the overlaps"
         )
-    return complete
 
 
 def _refuse_blind_cameras(recording: Recording) -> None:
@@ -153,25 +157,11 @@ def _refuse_blind_cameras(recording: Recording) -> None:
         )
 
 
-def _collect(
-    recording: Recording, replay: SurroundReplay, motion: VehicleMotion | None, refused: Refusals
-) -> tuple[list[SurroundSet[int]], list[NDArray[np.uint8]]]:
-    """Return the sets with the images' log times, and thumbnails when there is no `motion` to fill meanwhile.
-
-    Messages that tell no motion are added to `refused`.
-    """
-
-    def add_motion(message: RecordedMessage) -> None:
-        try:
-            if motion is not None:
-                motion.add(recording.deserialize(message))
-        except CvcDepthError as error:
-            refused.add(str(error))
-
-    handlers = {} if motion is None else {motion.topic: add_motion}
+def _collect(replay: SurroundReplay, truth: RecordedTruth) -> tuple[list[SurroundSet[int]], list[NDArray[np.uint8]]]:
+    """Return the sets with the images' log times, and thumbnails when there is no motion for `truth` to read along."""
     sets, thumbnails = [], []
-    for found in replay.sets(handlers=handlers):
-        if motion is None:
+    for found in replay.sets(handlers=truth.handlers):
+        if truth.motion is None:
             thumbnail = _thumbnail(found, replay.layout.anchor_camera)
             if thumbnail is None:
                 continue

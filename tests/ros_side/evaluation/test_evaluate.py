@@ -79,7 +79,7 @@ def two_sets(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_run_and_evaluate_give_the_same_depth_bit_for_bit(two_sets: Path, tmp_path: Path):
     job = EvaluationJob("two_sets", str(two_sets), EvaluationSettings(untrained=True, height=64, width=96))
     with open_evaluation(job) as evaluation:
-        scored = [measured.estimated.depth.depth for measured in evaluation.sets(*evaluation.window)]
+        scored = [measured.estimated.result.depth for measured in evaluation.sets(*evaluation.window)]
     assert len(scored) == 2
     assert main(["run", str(two_sets), "-o", str(tmp_path / "depth"), *SMALL]) == 0
     for index, name in enumerate(CAMERAS):
