@@ -32,7 +32,8 @@ from cvcdepth_core.training.trainer import Trainer
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.settings import MatchingSettings
 from cvcdepth_ros.training_data.index import RecordingIndex, load_index
-from cvcdepth_ros.training_data.samples import RecordingBatches, first_held_out
+from cvcdepth_ros.training_data.loader import RecordingBatches
+from cvcdepth_ros.training_data.sample_choice import first_held_out
 
 PUBLISHED = Path(__file__).parent.parent / "config" / "training" / "ablation"
 VARIANTS = {

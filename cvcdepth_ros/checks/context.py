@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all checks look at: one recording, read once, with its rig as far as it can be told."""
+"""Input of all checks: one recording, read once, with its rig as far as it is known."""
 
 from __future__ import annotations
 
@@ -24,35 +24,37 @@ from cvcdepth_ros.recordings.refusals import Refusals
 from cvcdepth_ros.recordings.rig import IMAGE_TYPES, chosen_layout
 from cvcdepth_ros.recordings.rig_messages import RigMessages
 from cvcdepth_ros.recordings.topic_timing import TopicTiming
+from cvcdepth_ros.settings import MatchingSettings
 from cvcdepth_ros.surround_sets.synchronizer import SurroundSet, SurroundSynchronizer
 
 Status = Literal["passed", "warning", "failed", "skipped"]
 
+_DEFAULTS = MatchingSettings()
 _KEPT_SWEEPS = 3
 _SHOWN_SETS = 3
 
 
 @dataclass(frozen=True)
 class CheckResult:
-    """What one check found."""
+    """Result of one check."""
 
     status: Status
-    """skipped: there is nothing to check, or what it needs is missing and told by another check."""
+    """skipped: there is nothing to check, or what it needs is missing, which another check reports."""
     finding: str
     """One line, with the values that were seen."""
     remedy: str | None = None
-    """What to do about it."""
+    """What the user can do about it."""
     values: dict[str, Any] = field(default_factory=dict)
     """The values, for machines."""
 
 
 @dataclass(frozen=True)
 class CheckOptions:
-    """What the recording is to be good for."""
+    """What the recording is checked for, and which part of it."""
 
-    tolerance: float = 0.1
+    tolerance: float = _DEFAULTS.tolerance
     """Seconds that two images of one set may be apart."""
-    queue_size: int = 10
+    queue_size: int = _DEFAULTS.queue_size
     """Images that are kept per camera while their set is not complete."""
     base_frame: str = "base_link"
     """The vehicle's frame where no rig file names it."""
@@ -97,7 +99,7 @@ class CheckContext:
         self.lidars = messages.lidars if options.lidar is None else options.lidar
         """The topics of the LiDARs."""
         self.camera_clouds = messages.camera_clouds if options.lidar is None else ()
-        """Topics with clouds that were made of pictures, of the cameras that are no LiDARs."""
+        """Topics with clouds that were made from camera images."""
         self.motion = self._found_motion()
         self.refused_motion = Refusals()
         """Impossible poses."""
@@ -121,7 +123,7 @@ class CheckContext:
 
     @cached_property
     def rig(self) -> Rig | None:
-        """The complete rig; None where something is missing, which the checks of its parts tell."""
+        """The complete rig; None where something is missing, which the checks of its parts report."""
         if self.layout is None or self.assembler is None or self.assembler.problems():
             return None
         return self.assembler.rig()
@@ -215,7 +217,7 @@ class CheckContext:
         return found
 
     def _add_stamped(self, message: RecordedMessage, cameras: Iterable[str]) -> None:
-        """Take in an image or a sweep."""
+        """Add an image or a sweep."""
         if message.topic not in self.timings:
             type_ = self.recording.topics[message.topic].type
             self.timings[message.topic] = TopicTiming(type_, self.recording.typestore)

@@ -107,7 +107,7 @@ def _judged_lidars(context: CheckContext, lidars: Sequence[str]) -> CheckResult:
 def _projections(
     context: CheckContext, lidars: Sequence[str], rig: Rig, transforms: TransformTree
 ) -> tuple[dict[str, dict[str, float]], list[str]]:
-    """Return what `_projected` says of each LiDAR, and why there is nothing to say of the others."""
+    """Return the shares of `_projected` by LiDAR, and why the other LiDARs have none."""
     shares: dict[str, dict[str, float]] = {}
     refusals = []
     for topic in lidars:
@@ -133,7 +133,7 @@ def _with_left_out(context: CheckContext, result: CheckResult) -> CheckResult:
 
 
 def _worsened(result: CheckResult, finding: str, remedy: str) -> CheckResult:
-    """Add to what a check found something that is no more than a warning."""
+    """Return a check's result with a further finding that is no more than a warning."""
     status: Status = "failed" if result.status == "failed" else "warning"
     remedy = f"{result.remedy}; {remedy}" if result.remedy else remedy
     return replace(result, status=status, finding=f"{result.finding}; {finding}", remedy=remedy)
@@ -194,7 +194,7 @@ def _share_inside(camera: Camera, points: NDArray[np.float64]) -> float:
 
 
 def check_motion(context: CheckContext) -> CheckResult:
-    """Measure how far and how long the vehicle moves: one that stands gives nothing to learn from."""
+    """Measure how far and how long the vehicle moves: there is nothing to learn from one that stands still."""
     layout = context.layout
     if layout is None:
         return _NEEDS_RIG

@@ -105,7 +105,7 @@ def _describe(layout: "RigLayout", rig: "Rig") -> dict[str, Any]:
 
 
 def _view(camera: "Camera") -> dict[str, Any]:
-    """Where the camera looks, how widely, and what its pictures are like."""
+    """Return the camera's direction, field of view, and the kind of its pictures."""
     calibration = camera.calibration
     axis = camera.base_T_camera[:3, 2]
     (fx, _, cx), (width, height) = calibration.rectified_intrinsics[0], calibration.image_size

@@ -104,7 +104,7 @@ def execute(arguments: argparse.Namespace) -> None:
 
 @contextmanager
 def _trace(path: Path | None) -> "Iterator[StageLatencies]":
-    """Give stage latencies that write a trace, where a file for it is named."""
+    """Yield stage latencies that write a trace, where a file for it is named."""
     from cvcdepth_ros.surround_sets.latencies import StageLatencies
     from cvcdepth_ros.surround_sets.trace_file import TraceFile
 
@@ -169,7 +169,7 @@ def _with_progress(
 
 @contextmanager
 def _stoppable() -> "Iterator[threading.Event]":
-    """Give an event that Ctrl-C or SIGTERM sets, so that the set in hand is still written; a second one interrupts."""
+    """Yield an event that Ctrl-C or SIGTERM sets, so that the set in hand is still written; a second one interrupts."""
     stop = threading.Event()
 
     def handle(*_: object) -> None:

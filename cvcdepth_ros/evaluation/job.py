@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is to be evaluated, and how: a unit of work that can be sent to another process or machine."""
+"""An evaluation's settings and one recording's job, which can be sent to another process or machine."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class Dependencies(NamedTuple):
-    """What scores depend on beside recording and configuration."""
+    """The version and checkpoint that scores depend on, beside recording and configuration."""
 
     version: str
     """Of this program."""
@@ -58,14 +58,14 @@ class EvaluationSettings(MatchingSettings, ModelSettings):
 
     @property
     def scores(self) -> ScoreSettings:
-        """What is measured."""
+        """Settings of the scorer."""
         from cvcdepth_core.scoring.scores import ScoreSettings
 
         return ScoreSettings(min_depth=self.min_depth, max_depth=self.max_depth)
 
     @property
     def occlusion(self) -> OcclusionFilter | None:
-        """Which LiDAR points are no truth."""
+        """Filter of LiDAR points that the camera cannot see; None where it is switched off."""
         from cvcdepth_core.scoring.ground_truth import OcclusionFilter
 
         return None if self.no_occlusion_filter else OcclusionFilter()
@@ -77,11 +77,11 @@ class EvaluationSettings(MatchingSettings, ModelSettings):
 
     @property
     def notice(self) -> str:
-        """What must be said of the network's depth."""
+        """Warning about the network's depth; empty where none is needed."""
         return "" if self.predictor else super().notice
 
     def dependencies(self) -> Dependencies:
-        """Look at what this machine has; CheckpointError says what is wrong with the checkpoint."""
+        """Return this machine's version and checkpoint; CheckpointError says what is wrong with the checkpoint."""
         from cvcdepth_core.networks.checkpoint import load_checkpoint
 
         path = self.checkpoint_path
@@ -103,7 +103,7 @@ class EvaluationJob:
     """One recording to evaluate."""
 
     name: str
-    """What results call the recording; unique among those that are evaluated together."""
+    """The recording's name in results; unique among those that are evaluated together."""
     path: str
     settings: EvaluationSettings
     layout: RigLayout | None = None

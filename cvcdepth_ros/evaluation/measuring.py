@@ -31,20 +31,20 @@ from cvcdepth_ros.surround_sets.latencies import StageLatencies
 from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet
 
 Progress = Callable[[float], None]
-"""Told which share of the recording is done."""
+"""Called with the share of the recording that is done."""
 
 _LONGEST_STEP_NS = NANOSECONDS  # between two sets that are compared along the vehicle's way
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredSet:
-    """One set's depth and what the recording tells of the truth."""
+    """One set's depth and the recording's ground truth for it."""
 
     estimated: EstimatedSet[RecordedImage]
     truth: Sequence[SparseDepth]
     """Of each camera, in the rig's order, at its picture's full size; empty where there is none."""
     world_T_base: Sequence[Pose] | None
-    """The vehicle's pose at each camera's moment; None where the recording does not tell."""
+    """The vehicle's pose at each camera's moment; None where it is not recorded."""
     lidar: Points | None
     """[M, 3] metres in the base frame at the anchor's moment."""
 
@@ -77,11 +77,11 @@ class MeasuredSet:
 
 @dataclass(frozen=True, eq=False)
 class RecordingScores:
-    """All that was found out about one recording."""
+    """The scores of one recording."""
 
     name: str
     summary: dict[str, Any]
-    """What was read and used, with JSON's types."""
+    """Counts and sources of what was read and used, with JSON's types."""
     scores: Scores
     agreement: AgreementTable
     log_times: NDArray[np.int64]
@@ -129,7 +129,7 @@ class RecordingEvaluation:
         return start, end if self.job.duration is None else min(end, start + round(self.job.duration * NANOSECONDS))
 
     def sets(self, start: int, stop: int, stamp_ns: int | None = None) -> Iterator[MeasuredSet]:
-        """Give the sets of start <= log_time < stop (ns), in order; with a stamp, the set of that stamp only."""
+        """Yield the sets of start <= log_time < stop (ns), in order; with a stamp, the set of that stamp only."""
         ahead = self.truth.ahead_ns
         self.truth.read(start - ahead, start)
         pending: deque[EstimatedSet[RecordedImage]] = deque()
@@ -154,7 +154,7 @@ class RecordingEvaluation:
 
     @property
     def latencies(self) -> StageLatencies:
-        """Where the time went."""
+        """Durations of the stages."""
         return self.depths.latencies
 
     def _measured(self, estimated: EstimatedSet[RecordedImage]) -> MeasuredSet:
@@ -171,7 +171,7 @@ class RecordingEvaluation:
 def open_evaluation(job: EvaluationJob) -> Iterator[RecordingEvaluation]:
     """Open the job's recording; the errors of the family name what is missing.
 
-    The network runs in as many CPU threads as the settings say; what torch had before is restored at the end.
+    The network runs in as many CPU threads as the settings name; torch's former number is restored at the end.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(job.settings.threads)

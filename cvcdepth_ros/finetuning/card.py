@@ -95,7 +95,7 @@ def _recording(tuned: FineTuned, number: int) -> dict[str, Any]:
         "from": _time(first),
         "seconds": (last - first) / NANOSECONDS,
         "sets": len(index),
-        "outside_of_recorded_motion": index.unplaced,
+        "outside_of_recorded_motion": index.without_motion,
         "training_samples": tuned.samples[number],
         "held_out_sets": _scored_sets(tuned, str(index.path)),
         "cameras": index.layout.names,

@@ -18,7 +18,7 @@ from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings, uniqu
 from cvcdepth_ros.evaluation.result import EvaluationResult
 from cvcdepth_ros.evaluation.workers import KeptParts, evaluate_all
 from cvcdepth_ros.training_data.index import RecordingIndex
-from cvcdepth_ros.training_data.samples import first_held_out
+from cvcdepth_ros.training_data.sample_choice import first_held_out
 
 _BAR = "{desc}: {percentage:3.0f}%|{bar}| {n:.1f} of {total} recordings [{elapsed}<{remaining}]"
 _FEWEST_SETS = 2  # the scores along the way need two

@@ -21,7 +21,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class MailboxStatistics:
-    """What became of the sets: received = delivered + replaced + stale + after_close + one that may be waiting."""
+    """Counts of the sets: received = delivered + replaced + stale + after_close + one that may be waiting."""
 
     received: int = 0
     delivered: int = 0
@@ -51,7 +51,7 @@ class Mailbox(Generic[T]):
 
     @property
     def closed(self) -> bool:
-        """Whether `close` was called: tells a None of `get` from a timeout."""
+        """Whether `close` was called: distinguishes a None of `get` from a timeout."""
         return self._closed
 
     def put(self, surround_set: SurroundSet[T]) -> bool:

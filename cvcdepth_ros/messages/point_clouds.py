@@ -29,7 +29,7 @@ def points_from_message(message: Any, topic: str) -> NDArray[np.float64]:
 
 
 def has_colours(message: Any) -> bool:
-    """Whether the points of a PointCloud2 have colours, as those of clouds that were made of pictures do."""
+    """Whether the points of a PointCloud2 have colours, as those of clouds that were made from camera images do."""
     return any(field.name in _COLOURS for field in message.fields)
 
 

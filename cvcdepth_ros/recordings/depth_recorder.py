@@ -12,7 +12,7 @@ from cvcdepth_ros.bags import RecordedMessage, RecordingWriter
 from cvcdepth_ros.messages.conversion import bag_message_factory
 from cvcdepth_ros.messages.point_clouds import POINT_CLOUD_TYPE
 from cvcdepth_ros.messages.transforms import TransformTree, frame_name
-from cvcdepth_ros.recordings.fixed_frames import MOVING_TRANSFORMS
+from cvcdepth_ros.recordings.fixed_frames import MOVING_TRANSFORMS, TRANSFORM_TYPE, has_transforms
 from cvcdepth_ros.recordings.replay import Handlers, RecordedImage, SurroundReplay
 from cvcdepth_ros.recordings.rig_messages import STATIC_TRANSFORMS
 from cvcdepth_ros.settings import OutputSettings
@@ -27,14 +27,14 @@ from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet
 CloudChoice = Literal["merged", "all", "none"]
 
 _NODE = "/surround_depth"
-_TRANSFORM_TYPE = "tf2_msgs/msg/TFMessage"
 _SAME_POSE = 1e-6  # metres, and elements of the rotation
 
 
 class DepthRecorder:
     """Writes a new rosbag2 folder with the depth of a replayed recording; use it as a context manager.
 
-    Everything lies at the log time of the image that it comes from, so that both recordings can be shown together.
+    Every message has the log time of the image that it was computed from, so that both recordings can be shown
+    together.
     """
 
     def __init__(
@@ -42,8 +42,8 @@ class DepthRecorder:
     ) -> None:
         """Create the folder, announce the topics and write the fixed transforms at the log time `start` (ns).
 
-        Raises RecordingError when the folder exists already, and TransformError when the rig file's poses do not go
-        together with the recording's frames.
+        Raises RecordingError when the folder exists already, and TransformError when the rig file's poses
+        contradict the recording's frames.
         """
         self._replay = replay
         self._settings = settings
@@ -54,10 +54,10 @@ class DepthRecorder:
         self._writer = RecordingWriter(path)
         for topic, type_ in self._topics.items():
             self._writer.add_topic(f"{_NODE}/{topic}", type_)
-        self._writer.add_topic(STATIC_TRANSFORMS, _TRANSFORM_TYPE)
+        self._writer.add_topic(STATIC_TRANSFORMS, TRANSFORM_TYPE)
         self._writer.write(STATIC_TRANSFORMS, start, static_transforms)
         self.handlers = self._moving_transforms()
-        """What to do with the replayed recording's other topics: `/tf` is copied."""
+        """Handlers for the replayed recording's other topics: `/tf` is copied."""
 
     def __enter__(self) -> "DepthRecorder":
         return self
@@ -73,10 +73,10 @@ class DepthRecorder:
             self._writer.write(f"{_NODE}/{output.topic}", log_time, output.message)
 
     def _moving_transforms(self) -> Handlers:
-        moving = self._replay.recording.topics.get(MOVING_TRANSFORMS)
-        if moving is None or moving.type != _TRANSFORM_TYPE:
+        recording = self._replay.recording
+        if not has_transforms(recording, MOVING_TRANSFORMS):
             return {}
-        self._writer.add_topic(MOVING_TRANSFORMS, _TRANSFORM_TYPE, moving.qos or ())
+        self._writer.add_topic(MOVING_TRANSFORMS, TRANSFORM_TYPE, recording.topics[MOVING_TRANSFORMS].qos or ())
         return {MOVING_TRANSFORMS: self._copy}
 
     def _copy(self, message: RecordedMessage) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""LiDAR sweeps out of PointCloud2 messages, moved to where the vehicle was when a camera fired. No ROS here."""
+"""LiDAR sweeps, moved to where the vehicle was at the exposure of a camera. No ROS here."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class LidarSweeps:
         motion: VehicleMotion | None,
         tolerance: float,
     ) -> None:
-        """`motion` is None where the recording has none: then the vehicle counts as standing still.
+        """`motion` is None where the recording has none: then the vehicle is taken to stand still.
 
         `tolerance`, seconds, is the greatest distance in time between a sweep and the moment it is used for.
         """
@@ -52,7 +52,7 @@ class LidarSweeps:
         self._tolerance = to_nanoseconds(tolerance)
 
     def add(self, topic: str, message: Any) -> None:
-        """Take in a sweep.
+        """Add a sweep.
 
         Raises RecordingError, naming the topic and the field, when it cannot be read, and TransformError, naming the
         topic and the frame, when that has no transform to the base frame.

@@ -21,7 +21,7 @@ _MESSAGES_TO_FIND_MOTION = 1000
 
 
 class MotionLink(NamedTuple):
-    """The moving link that tells where the vehicle is."""
+    """The moving link between the world and the vehicle."""
 
     topic: str
     parent: str
@@ -48,7 +48,7 @@ def find_motion_link(recording: Recording, base_frame: str, static: TransformTre
 
 
 class VehicleMotion:
-    """Where the vehicle was over time: a moving link of `/tf`, or an odometry topic."""
+    """The vehicle's pose over time, from a moving link of `/tf` or an odometry topic."""
 
     def __init__(self, link: MotionLink) -> None:
         """Follow this link; messages of its topic are still to be added."""
@@ -69,7 +69,7 @@ class VehicleMotion:
         self._track.add(stamp_ns(message), pose)
 
     def base_pose(self, stamp: int) -> Pose:
-        """Return world_T_base [4, 4], the world being the frame that the motion is told in, at a stamp (ns).
+        """Return world_T_base [4, 4], the world being the motion link's parent frame, at a stamp (ns).
 
         Raises TransformError outside of the time for which messages were added: nothing is extrapolated.
         """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What of a recording could not be used, counted."""
+"""Counts and reasons of the messages and sets that cannot be used."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,7 +24,7 @@ class Refusals:
 
     @contextmanager
     def instead_of_errors(self) -> Iterator[None]:
-        """Count one more where the block fails with one of this program's errors; that goes no further."""
+        """Count an error of the family that the block raises, in place of raising it."""
         try:
             yield
         except CvcDepthError as error:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recording's surround sets and their depth, through the node's own matching, preprocessing and estimator.
 
-No ROS here. `SurroundReplay` gives the sets (for training, say), `DepthReplay` adds the depth. Every set is given:
-there is no clock to keep up with, hence no mailbox.
+No ROS here. `SurroundReplay` gives the sets (for training, say), `DepthReplay` adds the depth. No set is
+skipped: there is no clock to keep up with, hence no mailbox.
 """
 
 import math
@@ -56,7 +56,7 @@ class SurroundReplay:
         self.recording = recorded.recording
         self.layout = recorded.layout
         self.unreadable = Refusals()
-        """Images and CameraInfo whose bytes are no such message."""
+        """Images and CameraInfos that cannot be deserialised."""
         self._assembler = recorded.assembler()
         self._rig: Rig | RigError = self._assembler.rig()
         self._tolerance = matching.tolerance
@@ -83,13 +83,13 @@ class SurroundReplay:
 
     @property
     def statistics(self) -> SynchronizerStatistics:
-        """What became of the images so far."""
+        """Counts of the images so far: matched, queued, dropped."""
         return self._synchroniser.statistics()
 
     def sets(
         self, start: int | None = None, stop: int | None = None, handlers: Handlers | None = None
     ) -> Iterator[SurroundSet[RecordedImage]]:
-        """Give the sets of the messages with start <= log_time < stop (ns), in order.
+        """Yield the sets of the messages with start <= log_time < stop (ns), in order.
 
         `handlers` are given the messages of further topics in between, at their time; topics that are not in the
         recording are passed over.
@@ -108,7 +108,7 @@ class SurroundReplay:
         yield from self._synchroniser.flush()
 
     def why_no_set(self, start: int | None = None, stop: int | None = None) -> str:
-        """Explain why `sets` gave none: which cameras are silent, or too far apart for the tolerance."""
+        """Return why `sets` yielded none: which cameras are silent, or too far apart for the tolerance."""
         silent = [name for name, camera in self.statistics.cameras.items() if not camera.received]
         if silent:
             return f"no image of camera {', '.join(silent)}"
@@ -151,7 +151,7 @@ class SurroundReplay:
 
 
 class DepthReplay:
-    """Estimates every set of a replay. A set that cannot be estimated is left out and told in `refused`."""
+    """Estimates every set of a replay. A set that cannot be estimated is left out and counted in `refused`."""
 
     def __init__(
         self, replay: SurroundReplay, estimator: DepthPredictor, latencies: StageLatencies | None = None
@@ -170,7 +170,7 @@ class DepthReplay:
         handlers: Handlers | None = None,
         stamp_ns: int | None = None,
     ) -> Iterator[EstimatedSet[RecordedImage]]:
-        """Give the sets of `SurroundReplay.sets` with their depth; with a stamp, the set of that stamp only."""
+        """Yield the sets of `SurroundReplay.sets` with their depth; with a stamp, the set of that stamp only."""
         for images in self._replay.sets(start, stop, handlers):
             if stamp_ns not in (None, images.stamp_ns):
                 continue
@@ -184,7 +184,7 @@ class DepthReplay:
                 yield EstimatedSet(images, surround.rig, depth)
 
     def why_no_set(self, start: int | None = None, stop: int | None = None) -> str:
-        """Explain why `sets` gave none: what was refused, else what `SurroundReplay.why_no_set` says."""
+        """Return why `sets` yielded none: what was refused, else `SurroundReplay.why_no_set`."""
         for refusals in (self.refused, self._replay.unreadable):
             if refusals.count:
                 return str(refusals)

@@ -65,7 +65,7 @@ class RecordedRig:
         return RecordedRig(self.recording, layout, self._messages)
 
     def assembler(self) -> RigAssembler:
-        """Return the rig as it was assembled, to go on with: for whoever reads further CameraInfos."""
+        """Return a new assembler with this rig in it, to which later CameraInfos can be added."""
         return self._messages.assembler(self.layout)
 
     @property
@@ -75,12 +75,12 @@ class RecordedRig:
 
     @property
     def lidars(self) -> tuple[str, ...]:
-        """The topics of the LiDARs: those of all point clouds that were not made of pictures."""
+        """The topics of the LiDARs: those of all point clouds that were not made from camera images."""
         return self._messages.lidars
 
     @property
     def camera_clouds(self) -> tuple[str, ...]:
-        """The topics with clouds that were made of pictures."""
+        """The topics with clouds that were made from camera images."""
         return self._messages.camera_clouds
 
     def vehicle_motion(self) -> VehicleMotion | None:
@@ -103,7 +103,7 @@ def chosen_layout(recording: Recording, layout: RigLayout | None, base_frame: st
 
 
 def discover_layout(recording: Recording, base_frame: str = "base_link") -> RigLayout:
-    """Find the recording's cameras; calibrations and poses are still open.
+    """Return the recording's cameras as they are found by their topics, without calibrations and poses.
 
     Raises RecordingError when there are fewer than two.
     """
@@ -122,7 +122,7 @@ def recorded_cameras(recording: Recording) -> list[CameraEntry]:
 
 
 def topics_without_images(recording: Recording) -> Iterator[str]:
-    """Give the camera_info topics beside which no image was recorded: a rig that is found would silently lack them."""
+    """Yield the camera_info topics without images in their namespace: a rig that is found would silently lack them."""
     seeing = {camera.camera_info_topic for camera in recorded_cameras(recording)}
     for topic in recording.topics.values():
         if topic.type == CAMERA_INFO_TYPE and topic.name not in seeing and not is_of_depth(topic.name):
@@ -130,12 +130,12 @@ def topics_without_images(recording: Recording) -> Iterator[str]:
 
 
 def is_of_depth(topic: str) -> bool:
-    """Say whether a topic's name tells that it is of depth images."""
+    """Whether a topic carries depth images, by its name."""
     return any(part.lower().startswith(("depth", "compresseddepth")) for part in topic.split("/"))
 
 
 def topic_problems(recording: Recording, layout: RigLayout) -> Iterator[str]:
-    """Say what is wrong with the topics that the cameras need, camera by camera."""
+    """Yield what is wrong with the topics that the cameras need, camera by camera."""
     for camera in layout.cameras:
         problem = _topic_problem(recording, camera.image_topic, IMAGE_TYPES)
         if problem is None and (camera.calibration is None or camera.frame_id is None):

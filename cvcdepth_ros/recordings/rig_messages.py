@@ -16,24 +16,30 @@ from cvcdepth_ros.messages.camera_discovery import CAMERA_INFO_TYPE
 from cvcdepth_ros.messages.point_clouds import POINT_CLOUD_TYPE, has_colours
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
 from cvcdepth_ros.messages.transforms import TransformTree, frame_name
-from cvcdepth_ros.recordings.fixed_frames import MOVING_TRANSFORMS, ObservedLink, add_fixed_frames, observed_links
+from cvcdepth_ros.recordings.fixed_frames import (
+    MOVING_TRANSFORMS,
+    ObservedLink,
+    add_fixed_frames,
+    has_transforms,
+    observed_links,
+)
 
 STATIC_TRANSFORMS = "/tf_static"
 
 
 class CloudSource(NamedTuple):
-    """Where the clouds of one topic come from, by its first message that can be read."""
+    """The source of one topic's clouds, by its first message that can be read."""
 
     frame_id: str
     has_colours: bool
-    """Whether they were made of pictures: no LiDAR gives colours."""
+    """Whether they were made from camera images: a LiDAR's points have no colours."""
 
 
 class RigMessages:
     """The first CameraInfo of each camera, all fixed transforms, and the sources of all point clouds of a recording.
 
-    They are read in one pass, which goes on without the topics of which nothing more is needed: blocks of the file that
-    hold nothing else are passed over.
+    They are read in one pass, which drops each topic as soon as nothing more of it is needed, so that blocks of the
+    file that hold nothing else are skipped.
     """
 
     def __init__(self, recording: Recording, layout: RigLayout | None) -> None:
@@ -50,25 +56,25 @@ class RigMessages:
         self._transforms = TransformTree()
         self._contradiction: TransformError | RecordingError | None = None
         self._awaited = {*_camera_info_topics(recording, layout), *cloud_topics(recording)}
-        if STATIC_TRANSFORMS in recording.topics:
+        if has_transforms(recording, STATIC_TRANSFORMS):
             self._awaited.add(STATIC_TRANSFORMS)
         self._read()
 
     @property
     def lidars(self) -> tuple[str, ...]:
-        """The topics of the LiDARs, sorted: those of all point clouds that were not made of pictures."""
+        """The topics of the LiDARs, sorted: those of all point clouds that were not made from camera images."""
         return tuple(topic for topic in cloud_topics(self._recording) if topic not in self.camera_clouds)
 
     @property
     def camera_clouds(self) -> tuple[str, ...]:
-        """The topics with clouds that were made of pictures, sorted.
+        """The topics with clouds that were made from camera images, sorted.
 
-        Those of the node itself are among them: they are no truth, where a recording was made while it ran.
+        The node's own clouds are among them where it ran during the recording: they are no ground truth.
         """
         return tuple(sorted(topic for topic, source in self._clouds.items() if source.has_colours))
 
     def assembler(self, layout: RigLayout) -> RigAssembler:
-        """Return `layout` with what was read added to it, as far as it goes.
+        """Return an assembler of `layout` with everything that was read for it; the rig may still be incomplete.
 
         Transforms are those of `/tf_static`; frames of cameras and LiDARs that are not connected there are looked for
         on `/tf`, see `add_fixed_frames`. Raises RecordingError for a CameraInfo that cannot be read, and TransformError
@@ -81,7 +87,7 @@ class RigMessages:
             add_camera_info(assembler, topic, info)
         if self._contradiction is not None:
             raise self._contradiction
-        if MOVING_TRANSFORMS in self._recording.topics:
+        if has_transforms(self._recording, MOVING_TRANSFORMS):
             self._add_fixed_frames(assembler)
         return assembler
 
@@ -95,7 +101,7 @@ class RigMessages:
             position = self._read_from(position)
 
     def _read_from(self, start: int) -> int | None:
-        """Take in what is awaited until a message comes that is not any more; return its log time, None at the end."""
+        """Take what is awaited up to the first message that is not any more; return its log time, None at the end."""
         for message in self._recording.messages(set(self._awaited), start):
             if message.topic not in self._awaited:
                 return message.log_time
@@ -164,7 +170,7 @@ def describe_camera_clouds(topics: Sequence[str]) -> str:
 
 
 def add_camera_info(assembler: RigAssembler, topic: str, message: Any) -> bool:
-    """Hand a CameraInfo to every camera of that topic; return whether it says anything new."""
+    """Add a CameraInfo to every camera of that topic; return whether it changes anything."""
     cameras = [camera.name for camera in assembler.layout.cameras if camera.camera_info_topic == topic]
     return True in [assembler.add_camera_info(camera, message) for camera in cameras]
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is in a recording: its files, topics with their times, and cameras. No ROS here."""
+"""A summary of a recording: its files, topics with their times, and cameras. No ROS here."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ _LATE_NS = 300_000_000
 
 
 class RecordedTruth:
-    """The LiDAR and the motion of a recording: what it knows of depth beside its pictures.
+    """Ground truth for depth from a recording's LiDARs, and the poses from its motion.
 
     Hand `handlers` to the replay. A set's truth is complete once messages up to `ahead_ns` after it were read.
     """
@@ -55,12 +55,12 @@ class RecordedTruth:
         }
 
     def read(self, start: int, stop: int) -> None:
-        """Take in the messages with start <= log_time < stop (ns), without those of the cameras."""
+        """Add the sweeps and poses of the messages with start <= log_time < stop (ns)."""
         for message in self._recording.messages(self.handlers, start, stop):
             self.handlers[message.topic](message)
 
     def points(self, time: int) -> Points | None:
-        """Return what the LiDARs saw nearest to a moment (ns), [M, 3] metres in the base frame then; None: nothing."""
+        """Return the LiDARs' points nearest to a moment (ns), [M, 3] metres in the base frame then, or None."""
         try:
             return self._sweeps.points_at(time)
         except TransformError as error:

@@ -17,12 +17,12 @@ from cvcdepth_ros.surround_sets.synchronizer import SurroundSet
 T = TypeVar("T")
 
 Outcome = Picture | ImageError
-"""What became of an image: the network's picture, or why there is none."""
+"""Result of preparing one image: the network's picture, or why there is none."""
 
 
 @dataclass(frozen=True, eq=False)
 class EstimatedSet(Generic[T]):
-    """A surround set with its depth, and the rig by which both are to be understood."""
+    """A surround set, its depth, and the rig that it was estimated with."""
 
     surround_set: SurroundSet[T]
     rig: Rig
@@ -36,7 +36,7 @@ def estimate_set(
 ) -> SurroundDepth:
     """Decode, rectify and estimate the image messages of one set, by camera; those that are damaged are left out.
 
-    ImageError says what is wrong with them when fewer than `required` images are left.
+    Raises ImageError, naming what is wrong with them, when fewer than `required` images are left.
     """
     rectifiers = surround.preprocessor.rectifiers
     outcomes = {

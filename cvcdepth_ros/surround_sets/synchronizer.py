@@ -49,12 +49,14 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 
 from cvcdepth_core.errors import ConfigError
 from cvcdepth_core.stamps import exposure_times, to_nanoseconds
+from cvcdepth_ros.settings import MatchingSettings
 
 if TYPE_CHECKING:
     from cvcdepth_core.rig.rig import RigLayout
 
 T = TypeVar("T")
 
+_DEFAULTS = MatchingSettings()
 _INTERVALS_FOR_PERIOD = 9
 _BEHIND_IN_A_ROW = 3
 _PATIENCE_PERIODS = 3
@@ -80,7 +82,7 @@ class SurroundSet(Generic[T]):
 
 @dataclass(frozen=True)
 class CameraStatistics:
-    """What became of one camera's images: received = matched + queued + the sum of dropped."""
+    """Counts of one camera's images: received = matched + queued + the sum of dropped."""
 
     received: int
     matched: int
@@ -113,7 +115,7 @@ class SurroundSynchronizer(Generic[T]):
         anchor: str,
         tolerance: float,  # s, largest difference between any two corrected stamps of a set
         offsets: Mapping[str, float] | None = None,  # s, camera -> subtracted from its stamps; 0 where not given
-        queue_size: int = 10,  # images per camera
+        queue_size: int = _DEFAULTS.queue_size,  # images per camera
         clock_jump: float = 1.0,  # s, a stamp this much behind its camera's newest is a clock step
         min_cameras: int = 0,  # images without which no set leaves; 0: one of every camera
     ) -> None:
@@ -143,7 +145,7 @@ class SurroundSynchronizer(Generic[T]):
 
     @classmethod
     def from_layout(
-        cls, layout: "RigLayout", tolerance: float, queue_size: int = 10, min_cameras: int = 0
+        cls, layout: "RigLayout", tolerance: float, queue_size: int = _DEFAULTS.queue_size, min_cameras: int = 0
     ) -> "SurroundSynchronizer[T]":
         """Match the cameras of a rig with its anchor and its stamp offsets; the rest as in the constructor."""
         offsets = {camera.name: camera.stamp_offset for camera in layout.cameras}
@@ -196,7 +198,7 @@ class SurroundSynchronizer(Generic[T]):
         return sets
 
     def _appoint_anchor(self) -> None:
-        """Let another camera stand in for an anchor that is missing, and the anchor return when it is there."""
+        """Replace an anchor that is missing by another camera, until it returns."""
         if self.required == len(self._streams):
             return
         candidates = (self._anchor, *self._streams)
@@ -266,7 +268,7 @@ class SurroundSynchronizer(Generic[T]):
 
 
 class _Stream(Generic[T]):
-    """One camera's queue in the order of corrected stamps [ns], and what its stamps tell of its clock."""
+    """One camera's queue in the order of corrected stamps [ns], and what its stamps show of its clock."""
 
     def __init__(self, offset: int, queue_size: int, clock_jump: int) -> None:
         self.offset = offset

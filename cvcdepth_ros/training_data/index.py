@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is in a recording for training: its surround sets and where the vehicle was at each exposure. No ROS here.
+"""Index of a recording for training: its surround sets and the vehicle's pose at each exposure. No ROS here.
 
 An index is built in one pass and kept beside the run; it is built anew when a file of the recording changes.
 """
@@ -45,17 +45,17 @@ class RecordingIndex:
     layout: RigLayout
     """The rig, complete."""
     stamps: NDArray[np.int64]
-    """[S, N] each image's own stamp, ns: by which its message is told from others."""
+    """[S, N] each image's own stamp, ns: identifies its message."""
     log_times: NDArray[np.int64]
     """[S, N] when each image was recorded, ns: where it is found again."""
     poses: NDArray[np.float64] | None
-    """[S, N, 4, 4] world_T_base at each camera's exposure; None where the recording tells no motion."""
+    """[S, N, 4, 4] world_T_base at each camera's exposure; None where no motion is recorded."""
     thumbnails: NDArray[np.uint8] | None
-    """[S, h, w] small grey pictures of the anchor camera, to see motion by where none is recorded."""
-    unplaced: int = 0
-    """Sets left out since the recorded motion does not reach them."""
+    """[S, h, w] small grey pictures of the anchor camera, to measure change by where no motion is recorded."""
+    without_motion: int = 0
+    """Sets left out since they lie outside of the recorded motion."""
     unread: tuple[str, ...] = ()
-    """What of the recording could not be read or used, in words."""
+    """Descriptions of messages and sets that could not be read or used."""
 
     @property
     def times(self) -> NDArray[np.int64]:
@@ -65,8 +65,8 @@ class RecordingIndex:
 
     @property
     def losses(self) -> list[str]:
-        """What of the recording is not there to learn from, in words."""
-        outside = [f"{self.unplaced} sets lie outside of the recorded motion"] if self.unplaced else []
+        """Descriptions of the parts of the recording that are missing from the index."""
+        outside = [f"{self.without_motion} sets lie outside of the recorded motion"] if self.without_motion else []
         return [*self.unread, *outside]
 
     def __len__(self) -> int:
@@ -83,7 +83,7 @@ def load_index(
 ) -> RecordingIndex:
     """Return the index of the recording at `path`, from `directory` when a current one is there, else built and kept.
 
-    `rig_layout` names cameras and what the recording does not tell; without it the cameras are found. Raises
+    `rig_layout` names cameras and what the recording lacks; without it the cameras are found. Raises
     RecordingError, RigError or TransformError, naming the recording, when it has no sets or no complete rig.
     """
     key = _key(path, matching, rig_layout)
@@ -126,13 +126,13 @@ def index_recording(recorded: RecordedRig, matching: MatchingSettings) -> Record
         log_times=_table(sets, placed, lambda found: [found.images[name] for name in layout.names]),
         poses=None if poses is None else np.array([poses[i] for i in placed]).reshape(-1, len(layout.names), 4, 4),
         thumbnails=np.stack(thumbnails) if motion is None else None,
-        unplaced=len(sets) - len(placed),
+        without_motion=len(sets) - len(placed),
         unread=tuple(_unread(replay, truth.refused, len(sets))),
     )
 
 
 def _unread(replay: SurroundReplay, refused: Refusals, sets: int) -> Iterator[str]:
-    """Give what of a recording that was read to its end, and gave so many sets, could not be read or used."""
+    """Yield descriptions of what could not be read or used, after the replay's end and with so many sets left."""
     if replay.recording.damage:
         yield f"not everything could be read: {replay.recording.damage}"
     yield from (str(found) for found in (replay.unreadable, refused) if found.count)
@@ -218,7 +218,7 @@ def _write(cached: Path, index: RecordingIndex, key: str) -> None:
         content,
         key=np.array(key),
         layout=np.array(index.layout.model_dump_json()),
-        unplaced=np.array(index.unplaced),
+        unplaced=np.array(index.without_motion),
         unread=np.array(json.dumps(index.unread)),
         **{name: array for name, array in arrays.items() if array is not None},
     )
