@@ -171,17 +171,17 @@ class DepthReplay:
         stamp_ns: int | None = None,
     ) -> Iterator[EstimatedSet[RecordedImage]]:
         """Yield the sets of `SurroundReplay.sets` with their depth; with a stamp, the set of that stamp only."""
-        for images in self._replay.sets(start, stop, handlers):
-            if stamp_ns not in (None, images.stamp_ns):
+        for surround_set in self._replay.sets(start, stop, handlers):
+            if stamp_ns not in (None, surround_set.stamp_ns):
                 continue
             try:
                 surround = self._current_surround()
-                messages = {name: image.message for name, image in images.images.items()}
-                depth = estimate_set(messages, surround, self.latencies, self._replay.required)
+                messages = {name: image.message for name, image in surround_set.images.items()}
+                result = estimate_set(messages, surround, self.latencies, self._replay.required)
             except CvcDepthError as error:
-                self.refused.add(f"set at {images.stamp_ns} ns: {error}")
+                self.refused.add(f"set at {surround_set.stamp_ns} ns: {error}")
             else:
-                yield EstimatedSet(images, surround.rig, depth)
+                yield EstimatedSet(surround_set, surround.rig, result)
 
     def why_no_set(self, start: int | None = None, stop: int | None = None) -> str:
         """Return why `sets` yielded none: what was refused, else `SurroundReplay.why_no_set`."""
