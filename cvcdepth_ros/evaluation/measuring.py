@@ -7,7 +7,7 @@ import json
 from array import array
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from cvcdepth_core.errors import RecordingError
+from cvcdepth_core.estimator import DepthPredictor
 from cvcdepth_core.rig.poses import Pose
 from cvcdepth_core.scoring.consistency import AgreementTable, PosedDepth, spatial_rows, temporal_rows
 from cvcdepth_core.scoring.ground_truth import PinholeView, SparseDepth, overlap_pixels, sample_prediction
@@ -115,11 +116,12 @@ class RecordingScores:
 class RecordingEvaluation:
     """One opened recording, ready to be measured; make it with `open_evaluation`."""
 
-    def __init__(self, job: EvaluationJob, recorded: RecordedRig) -> None:
+    def __init__(self, job: EvaluationJob, recorded: RecordedRig, predictor: DepthPredictor | None = None) -> None:
+        """`predictor` is the job's where it is loaded already; without it, it is loaded here."""
         self.job = job
         self.replay = SurroundReplay(recorded, job.settings)
         self.truth = RecordedTruth(recorded, job.lidar, job.settings.lidar_tolerance)
-        self.depths = DepthReplay(self.replay, job.settings.build_predictor(self.replay.rig))
+        self.depths = DepthReplay(self.replay, predictor or job.settings.build_predictor(self.replay.rig))
 
     @property
     def window(self) -> tuple[int, int]:
@@ -151,6 +153,16 @@ class RecordingEvaluation:
         if not scoring.sets:
             raise RecordingError(f"{self.job.path}: no set: {self.depths.why_no_set(*self.window)}")
         return scoring.result(_summary(self, scoring))
+
+    def measured_set(self, stamp_ns: int, log_time: int) -> MeasuredSet:
+        """Measure a single set, which is known by its stamp and log time (ns); RecordingError when it is not there.
+
+        It is matched anew from shortly before it, by the rig and the network of this evaluation.
+        """
+        anew = RecordingEvaluation(self.job, self.replay.recorded, self.depths.estimator)
+        for measured in anew.sets(log_time - 2 * NANOSECONDS, log_time + NANOSECONDS, stamp_ns):
+            return measured
+        raise RecordingError(f"{self.job.path}: no set at {stamp_ns} ns")
 
     @property
     def latencies(self) -> StageLatencies:
@@ -188,12 +200,29 @@ def evaluate_recording(job: EvaluationJob, progress: Progress | None = None) -> 
         return evaluation.scores(progress)
 
 
-def measured_set(job: EvaluationJob, stamp_ns: int, log_time: int) -> MeasuredSet:
-    """Measure one set again, which is known by its stamp and log time (ns); RecordingError when it is not there."""
-    with open_evaluation(job) as evaluation:
-        for measured in evaluation.sets(log_time - 2 * NANOSECONDS, log_time + NANOSECONDS, stamp_ns):
-            return measured
-    raise RecordingError(f"{job.path}: no set at {stamp_ns} ns")
+class Remeasuring:
+    """Measures single sets again; the recording that was asked for last stays open, with its rig and its network.
+
+    Use it as a context manager.
+    """
+
+    def __init__(self) -> None:
+        self._opened = ExitStack()
+        self._evaluation: RecordingEvaluation | None = None
+
+    def __enter__(self) -> Remeasuring:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._opened.close()
+
+    def measured_set(self, job: EvaluationJob, stamp_ns: int, log_time: int) -> MeasuredSet:
+        """Measure a set of a job's recording; see `RecordingEvaluation.measured_set`."""
+        if self._evaluation is None or self._evaluation.job != job:
+            self._evaluation = None
+            self._opened.close()
+            self._evaluation = self._opened.enter_context(open_evaluation(job))
+        return self._evaluation.measured_set(stamp_ns, log_time)
 
 
 class _Scoring:
