@@ -27,7 +27,8 @@ from cvcdepth_core.training.config import OptimizerConfig, RecordingsConfig, Tra
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.settings import MatchingSettings
 from cvcdepth_ros.training_data.index import RecordingIndex, load_index
-from cvcdepth_ros.training_data.samples import RecordingBatches, SampleReader
+from cvcdepth_ros.training_data.loader import RecordingBatches
+from cvcdepth_ros.training_data.samples import SampleReader
 
 SAMPLE = Path(__file__).parent.parent / "samples" / "pandaset_002_excerpt"
 

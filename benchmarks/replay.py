@@ -42,8 +42,8 @@ from cvcdepth_ros.bags import RecordedMessage, Recording, RecordingWriter, open_
 from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings
 from cvcdepth_ros.evaluation.measuring import open_evaluation
 from cvcdepth_ros.messages.conversion import stamp_ns
-from cvcdepth_ros.recordings.lidar import points_from_message
-from cvcdepth_ros.recordings.rig import assemble_rig, discover_rig
+from cvcdepth_ros.messages.point_clouds import points_from_message
+from cvcdepth_ros.recordings.rig import RecordedRig
 
 SAMPLE = Path(__file__).parent.parent / "samples" / "pandaset_002_excerpt"
 STEP_NS = 1_000_000_000  # the sample is ten sets, 10 Hz
@@ -159,8 +159,9 @@ def evaluate(recording: str, settings: EvaluationSettings) -> Callable[[], dict[
 def straightforward(recording: str, settings: EvaluationSettings) -> Callable[[], dict[str, float]]:
     """Return what finds Abs Rel as one writes it at first."""
     with open_recording(recording) as opened:
-        layout = discover_rig(opened)
-        rig, fixed = layout.complete(), assemble_rig(opened, layout).transforms
+        recorded = RecordedRig.from_recording(opened)
+        layout, fixed = recorded.layout, recorded.transforms
+        rig = layout.complete()
     network = settings.model_copy(update={"backend": "torch_eager"}).build_estimator()
 
     def work() -> dict[str, float]:

@@ -10,7 +10,8 @@ import random
 
 from measuring import json_lines, measure_in_turns, print_line
 
-from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS, SurroundSynchronizer
+from cvcdepth_core.stamps import NANOSECONDS
+from cvcdepth_ros.surround_sets.synchronizer import SurroundSynchronizer
 
 CAMERAS = [f"camera{i}" for i in range(8)]
 RATE = 60  # Hz

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from cvcdepth_core.pointcloud import CloudLimits
 
 
+LIDAR_TOLERANCE = 0.1
+"""Seconds that a LiDAR sweep may be from the image that it is the truth of, unless something else is asked for."""
+
 _SMALLEST_VOXEL = 0.01
 
 

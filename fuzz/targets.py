@@ -21,8 +21,8 @@ from cvcdepth_core.images.rectifier import Rectifier
 from cvcdepth_core.rig.rig_file import load_rig_layout
 from cvcdepth_ros.bags import Recording, open_recording, typestore
 from cvcdepth_ros.messages.conversion import calibration_from_message, picture_from_message, stamp_ns
+from cvcdepth_ros.messages.point_clouds import points_from_message
 from cvcdepth_ros.messages.transforms import TransformTree
-from cvcdepth_ros.recordings.lidar import points_from_message
 from cvcdepth_ros.recordings.rig import discover_rig
 from cvcdepth_ros.recordings.summary import summarize
 

@@ -24,15 +24,16 @@ import torch
 
 from cvcdepth_core.networks.checkpoint import load_checkpoint
 from cvcdepth_core.rig.rig_file import load_rig_layout
+from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_core.training.config import TrainingConfig, load_training_config
 from cvcdepth_core.training.run_folder import CHECKPOINT_FILE
 from cvcdepth_core.training.starting_model import build_surround_model
 from cvcdepth_core.training.trainer import Trainer
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.settings import MatchingSettings
-from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS
 from cvcdepth_ros.training_data.index import RecordingIndex, load_index
-from cvcdepth_ros.training_data.samples import RecordingBatches, first_held_out
+from cvcdepth_ros.training_data.loader import RecordingBatches
+from cvcdepth_ros.training_data.sample_choice import first_held_out
 
 PUBLISHED = Path(__file__).parent.parent / "config" / "training" / "ablation"
 VARIANTS = {

@@ -29,7 +29,7 @@ from cvcdepth_core.rig_health.overlap_monitor import OverlapMonitor
 from cvcdepth_core.surround_depth import SurroundDepth
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.recordings.replay import DepthReplay, SurroundReplay
-from cvcdepth_ros.recordings.rig import discover_rig
+from cvcdepth_ros.recordings.rig import RecordedRig
 from cvcdepth_ros.settings import MatchingSettings, ModelSettings
 
 PERIOD_NS = 10**8
@@ -89,10 +89,10 @@ def recorded_drive(path: Path) -> Drive:
     """Estimate all of a recording's sets with the package's own model."""
     estimator = ModelSettings().build_estimator()
     with open_recording(path) as recording:
-        replay = SurroundReplay(recording, discover_rig(recording), MatchingSettings())
+        replay = SurroundReplay(RecordedRig.from_recording(recording), MatchingSettings())
         found = list(DepthReplay(replay, estimator).sets())
     rig = found[0].rig
-    return Drive(rig, SurroundDepthEstimator(rig, estimator), [estimated.depth for estimated in found])
+    return Drive(rig, SurroundDepthEstimator(rig, estimator), [estimated.result for estimated in found])
 
 
 def trial(healthy: Drive, changed: Drive, name: str, options: argparse.Namespace, costs: list[float]) -> str:

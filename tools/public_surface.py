@@ -176,7 +176,8 @@ def checkpoint_names() -> Iterator[str]:
     import torch
     from safetensors import safe_open
 
-    from cvcdepth_core.networks.checkpoint import DepthModelSpec, save_checkpoint
+    from cvcdepth_core.networks.checkpoint import save_checkpoint
+    from cvcdepth_core.networks.registry import DepthModelSpec
 
     spec = DepthModelSpec(height=64, width=64, min_depth=1.0, max_depth=80.0)
     with tempfile.TemporaryDirectory() as folder:

@@ -33,7 +33,8 @@ from cvcdepth_core.rig_health.overlap_views import (
     correlations,
     depth_disagreement,
 )
-from cvcdepth_core.rig_health.trend import NANOSECONDS, Trend
+from cvcdepth_core.rig_health.trend import Trend
+from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_core.surround_depth import SurroundDepth
 
 Quantity = Literal["misalignment", "disagreement", "sharpness"]

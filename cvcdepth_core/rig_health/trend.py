@@ -8,7 +8,7 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-NANOSECONDS = 10**9
+from cvcdepth_core.stamps import NANOSECONDS
 
 
 class Trend:

@@ -30,7 +30,7 @@ from cvcdepth_ros.node.parameters import declare_parameters, read_parameters
 from cvcdepth_ros.node.subscriptions import CameraInputs
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
 from cvcdepth_ros.surround_sets.output_messages import MERGED_CLOUD, SurroundMessages, output_types
-from cvcdepth_ros.surround_sets.set_estimation import estimate_set
+from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet, estimate_set
 from cvcdepth_ros.surround_sets.synchronizer import SurroundSet, SurroundSynchronizer
 
 
@@ -45,7 +45,8 @@ class StraightforwardNode(Node):  # type: ignore[misc] # rclpy is not annotated
         self._frame_ids = {camera.name: camera.frame_id or "" for camera in layout.cameras}
         self._estimator = self._settings.build_estimator()
         self._surround = SurroundDepthEstimator(layout.complete(), self._estimator)
-        self._synchroniser: SurroundSynchronizer[Any] = SurroundSynchronizer.of_rig(layout, self._settings.tolerance)
+        tolerance = self._settings.tolerance
+        self._synchroniser: SurroundSynchronizer[Any] = SurroundSynchronizer.from_layout(layout, tolerance)
         self._factory = ros_message_factory()
         self._messages = SurroundMessages(self._factory, self._settings.depth_encoding)
         self._outputs = {
@@ -73,14 +74,15 @@ class StraightforwardNode(Node):  # type: ignore[misc] # rclpy is not annotated
 
     def _handle(self, surround_set: SurroundSet[Any]) -> None:
         images, rig, limits = surround_set.images, self._surround.rig, self._settings.cloud_limits
-        depth = estimate_set(images, self._surround, self._latencies, len(images))
+        result = estimate_set(images, self._surround, self._latencies, len(images))
         with self._latencies.measure("postprocess"):
-            cloud = straightforward_cloud(depth, rig, limits)
+            cloud = straightforward_cloud(result, rig, limits)
             merged = self._factory.point_cloud(surround_set.stamp_ns, rig.base_frame, cloud)
         with self._latencies.measure("publish"):
             self._outputs[MERGED_CLOUD].publish(merged)
             others = self._outputs.keys() - {MERGED_CLOUD}
-            for output in self._messages.of_set(surround_set, depth, rig, self._frame_ids, limits, others.__contains__):
+            estimated = EstimatedSet(surround_set, rig, result)
+            for output in self._messages.of_set(estimated, self._frame_ids, limits, others.__contains__):
                 self._outputs[output.topic].publish(output.message)
 
     def _publish_diagnostics(self) -> None:

@@ -34,7 +34,7 @@ _LEFT_OUT = CheckResult("skipped", "left out as you wanted")
 
 
 class NumberedResult(NamedTuple):
-    """What one of `CHECKS` found; numbers count from 1."""
+    """Result of one of `CHECKS`; numbers count from 1."""
 
     number: int
     name: str

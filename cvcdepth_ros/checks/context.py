@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all checks look at: one recording, read once, with its rig as far as it can be told."""
+"""Input of all checks: one recording, read once, with its rig as far as it is known."""
 
 from __future__ import annotations
 
@@ -16,46 +16,51 @@ from cvcdepth_core.errors import ImageError, RecordingError, RigError, Transform
 from cvcdepth_core.images.decoding import Picture
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.rig.rig_file import RigLayout
+from cvcdepth_core.stamps import exposure_times
 from cvcdepth_ros.bags import RecordedMessage, Recording
 from cvcdepth_ros.messages.conversion import picture_from_message
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
-from cvcdepth_ros.recordings.lidar import VehicleMotion, find_lidars
-from cvcdepth_ros.recordings.rig import IMAGE_TYPES, collect_rig, discover_layout
+from cvcdepth_ros.recordings.motion import VehicleMotion, find_motion_link
+from cvcdepth_ros.recordings.refusals import Refusals
+from cvcdepth_ros.recordings.rig import IMAGE_TYPES, chosen_layout
+from cvcdepth_ros.recordings.rig_messages import RigMessages
 from cvcdepth_ros.recordings.topic_timing import TopicTiming
+from cvcdepth_ros.settings import MatchingSettings
 from cvcdepth_ros.surround_sets.synchronizer import SurroundSet, SurroundSynchronizer
 
 Status = Literal["passed", "warning", "failed", "skipped"]
 
+_DEFAULTS = MatchingSettings()
 _KEPT_SWEEPS = 3
 _SHOWN_SETS = 3
 
 
 @dataclass(frozen=True)
 class CheckResult:
-    """What one check found."""
+    """Result of one check."""
 
     status: Status
-    """skipped: there is nothing to check, or what it needs is missing and told by another check."""
+    """skipped: there is nothing to check, or what it needs is missing, which another check reports."""
     finding: str
     """One line, with the values that were seen."""
     remedy: str | None = None
-    """What to do about it."""
+    """What the user can do about it."""
     values: dict[str, Any] = field(default_factory=dict)
     """The values, for machines."""
 
 
 @dataclass(frozen=True)
 class CheckOptions:
-    """What the recording is to be good for."""
+    """What the recording is checked for, and which part of it."""
 
-    tolerance: float = 0.1
+    tolerance: float = _DEFAULTS.tolerance
     """Seconds that two images of one set may be apart."""
-    queue_size: int = 10
+    queue_size: int = _DEFAULTS.queue_size
     """Images that are kept per camera while their set is not complete."""
     base_frame: str = "base_link"
     """The vehicle's frame where no rig file names it."""
     lidar: tuple[str, ...] | None = None
-    """LiDAR topics; None for all of the recording, see `find_lidars`."""
+    """LiDAR topics; None for all of the recording, see `RigMessages.lidars`."""
     start: int | None = None
     """First log time to read, ns."""
     stop: int | None = None
@@ -88,12 +93,17 @@ class CheckContext:
         """Why the recorded transforms make no tree."""
         self.refusal: str | None = None
         """Why the cameras make no rig at all."""
-        self.assembler = self._collected(rig_layout)
+        layout = self._chosen_layout(rig_layout)
+        messages = RigMessages(recording, layout)
+        self.assembler = None if layout is None else self._assembled(messages, layout)
         """None where the cameras make no rig, or the transforms contradict each other."""
-        self.lidars, self.clouds_of_cameras = find_lidars(recording) if options.lidar is None else (options.lidar, ())
+        self.lidars = messages.lidars if options.lidar is None else options.lidar
+        """The topics of the LiDARs."""
+        self.camera_clouds = messages.camera_clouds if options.lidar is None else ()
+        """Topics with clouds that were made from camera images."""
         self.motion = self._found_motion()
-        self.motion_problem: str | None = None
-        """The first impossible pose."""
+        self.refused_motion = Refusals()
+        """Impossible poses."""
         self.timings: dict[str, TopicTiming] = {}
         """Of the topics with images and LiDAR sweeps."""
         self.images: list[ImageTimes] = []
@@ -114,7 +124,7 @@ class CheckContext:
 
     @cached_property
     def rig(self) -> Rig | None:
-        """The complete rig; None where something is missing, which the checks of its parts tell."""
+        """The complete rig; None where something is missing, which the checks of its parts report."""
         if self.layout is None or self.assembler is None or self.assembler.problems():
             return None
         return self.assembler.rig()
@@ -132,7 +142,7 @@ class CheckContext:
         """Return when a camera's images were taken [M], ns, sorted: their stamps without the camera's offset."""
         entries = self.assembler.layout.cameras if self.assembler else ()
         offsets = {entry.name: entry.stamp_offset_ns for entry in entries}
-        return self.stamps(camera) - offsets[camera]
+        return exposure_times(self.stamps(camera), offsets[camera])
 
     def match(
         self, layout: RigLayout, tolerance: float, changed_offsets: Mapping[str, float] | None = None
@@ -145,8 +155,12 @@ class CheckContext:
         sets = [found for image in self.images for found in synchroniser.add(*image)]
         return sets + synchroniser.flush()
 
-    def shown_sets(self) -> Iterator[dict[str, Picture]]:
-        """Decode a few sets, spread over the recording; pictures that cannot be decoded are left out."""
+    @cached_property
+    def shown_sets(self) -> list[dict[str, Picture]]:
+        """The pictures of a few sets, spread over the recording; those that cannot be decoded are left out."""
+        return [*self._decoded_sets()]
+
+    def _decoded_sets(self) -> Iterator[dict[str, Picture]]:
         if self.layout is None:
             return
         sets = self.match(self.layout, self.options.tolerance)
@@ -161,10 +175,16 @@ class CheckContext:
             pictures = {camera: self._picture(camera, message) for camera, message in read.items()}
             yield {camera: picture for camera, picture in pictures.items() if not isinstance(picture, str)}
 
-    def _collected(self, layout: RigLayout | None) -> RigAssembler | None:
+    def _chosen_layout(self, rig_file: RigLayout | None) -> RigLayout | None:
         try:
-            layout = layout or discover_layout(self.recording, self.options.base_frame)
-            return collect_rig(self.recording, layout)
+            return chosen_layout(self.recording, rig_file, self.options.base_frame)
+        except RecordingError as error:
+            self.refusal = str(error)
+            return None
+
+    def _assembled(self, messages: RigMessages, layout: RigLayout) -> RigAssembler | None:
+        try:
+            return messages.assembler(layout)
         except TransformError as error:
             self.contradiction = str(error)
         except (RecordingError, RigError) as error:
@@ -174,7 +194,8 @@ class CheckContext:
     def _found_motion(self) -> VehicleMotion | None:
         if self.assembler is None:
             return None
-        return VehicleMotion.find(self.recording, self.assembler.layout.base_frame, self.assembler.transforms)
+        link = find_motion_link(self.recording, self.assembler.layout.base_frame, self.assembler.transforms)
+        return None if link is None else VehicleMotion(link)
 
     def _read(self, progress: Callable[[int], None] | None) -> None:
         cameras = self._cameras_by_topic()
@@ -197,7 +218,7 @@ class CheckContext:
         return found
 
     def _add_stamped(self, message: RecordedMessage, cameras: Iterable[str]) -> None:
-        """Take in an image or a sweep."""
+        """Add an image or a sweep."""
         if message.topic not in self.timings:
             type_ = self.recording.topics[message.topic].type
             self.timings[message.topic] = TopicTiming(type_, self.recording.typestore)
@@ -210,11 +231,9 @@ class CheckContext:
             self.sweeps[message.topic].append(self._deserialized(message))
 
     def _add_motion(self, message: RecordedMessage) -> None:
-        try:
+        with self.refused_motion.instead_of_errors():
             if self.motion is not None:
                 self.motion.add(self.recording.deserialize(message))
-        except (RecordingError, TransformError) as error:
-            self.motion_problem = self.motion_problem or str(error)
 
     def _deserialized(self, message: RecordedMessage) -> Any:
         try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks of what the pictures show: anything at all, and what the rig says that they show."""
+"""Checks of the pictures' content: whether they show anything, and whether cameras were swapped."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from cvcdepth_ros.checks.context import CheckContext, CheckResult, Status
 
 _THUMBNAIL = (96, 54)
 _BLACK, _UNIFORM = 16.0, 2.0  # of 255: what the brightest hundredth stays below; the deviation of a picture of nothing
-_HEIGHT, _WIDTH = 48, 80  # enough to tell places, and a small picture forgives small errors of the rig
+_HEIGHT, _WIDTH = 48, 80  # enough to recognise a view, and a small picture tolerates small errors of the rig
 _MUCH_BETTER = 0.85  # of the error; in right rigs the best exchange has about 1.5 times the error
 
 
 def check_brightness(context: CheckContext) -> CheckResult:
     """Look for cameras whose pictures are black, or of one colour: a lens cap, a dead sensor, a night without light."""
-    shown = list(context.shown_sets())
+    shown = context.shown_sets
     if not shown:
         return CheckResult("skipped", "needs a set of pictures")
     empty = {camera: sum(_shows_nothing(found[camera]) for found in shown if camera in found) for camera in shown[0]}
     problems = {camera: count for camera, count in empty.items() if count}
     if not problems:
         return CheckResult("passed", f"the pictures of {len(empty)} cameras show something")
-    told = ", ".join(f"{camera} ({count} of {len(shown)})" for camera, count in problems.items())
+    listed = ", ".join(f"{camera} ({count} of {len(shown)})" for camera, count in problems.items())
     remedy = "uncover or mend the camera, or give a rig file without it (--rig); there is nothing to learn from it"
     status: Status = "failed" if len(shown) in problems.values() else "warning"
-    return CheckResult(status, f"black, or of one colour: pictures of {told}", remedy, {"pictures": problems})
+    return CheckResult(status, f"black, or of one colour: pictures of {listed}", remedy, {"pictures": problems})
 
 
 def _shows_nothing(picture: Picture) -> bool:
@@ -59,7 +59,7 @@ def _placed_pictures(context: CheckContext, rig: Rig) -> PlacedPictures | None:
     preprocessor = SurroundPreprocessor(rig, _HEIGHT, _WIDTH)
     sets = [
         np.stack([preprocessor.rectify(index, found[name]) for index, name in enumerate(rig.names)])
-        for found in context.shown_sets()
+        for found in context.shown_sets
         if len(found) == len(rig.names)
     ]
     if not sets:

@@ -11,15 +11,15 @@ from cvcdepth_ros.messages.transforms import frame_name
 from cvcdepth_ros.recordings.fixed_frames import MOVING_TRANSFORMS
 from cvcdepth_ros.recordings.rig import (
     IMAGE_TYPES,
-    STATIC_TRANSFORMS,
     is_of_depth,
     recorded_cameras,
     topic_problems,
     topics_without_images,
 )
+from cvcdepth_ros.recordings.rig_messages import STATIC_TRANSFORMS
 
 _INFO = "camera_info"
-_TOLD = 2
+_MAX_LISTED = 2
 
 
 def check_cameras(context: CheckContext) -> CheckResult:
@@ -112,8 +112,8 @@ def check_encodings(context: CheckContext) -> CheckResult:
 def _judged(problems: list[str], remedy: str, passed: str, values: Mapping[str, object] | None = None) -> CheckResult:
     values = {"problems": problems, **(values or {})}
     if problems:
-        more = f"; and {len(problems) - _TOLD} more" if len(problems) > _TOLD else ""
-        return CheckResult("failed", "; ".join(problems[:_TOLD]) + more, remedy, values)
+        more = f"; and {len(problems) - _MAX_LISTED} more" if len(problems) > _MAX_LISTED else ""
+        return CheckResult("failed", "; ".join(problems[:_MAX_LISTED]) + more, remedy, values)
     return CheckResult("passed", passed, values=values)
 
 
@@ -122,7 +122,7 @@ def _without_cameras() -> CheckResult:
 
 
 def _unknown(recording: Recording) -> Iterator[str]:
-    """Give the image topics beside which no camera_info was recorded."""
+    """Yield the image topics without a camera_info in their namespace."""
     known = tuple(camera.camera_info_topic.removesuffix(_INFO) for camera in recorded_cameras(recording))
     for topic in recording.topics.values():
         is_picture = topic.type in IMAGE_TYPES and not is_of_depth(topic.name)

@@ -13,18 +13,19 @@ from cvcdepth_core.errors import RecordingError, RigError, TransformError
 from cvcdepth_core.images.rectifier import Rectifier
 from cvcdepth_core.images.surround import self_occlusion_mask
 from cvcdepth_core.rig.rig import Camera, Rig
+from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_ros.checks.context import CheckContext, CheckResult, Status
 from cvcdepth_ros.messages.conversion import stamp_ns
 from cvcdepth_ros.messages.transforms import TransformTree
-from cvcdepth_ros.recordings.lidar import LidarSweeps, cloud_topics, told_of_cameras
-from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS
+from cvcdepth_ros.recordings.lidar import LidarSweeps
+from cvcdepth_ros.recordings.rig_messages import cloud_topics, describe_camera_clouds
+from cvcdepth_ros.settings import LIDAR_TOLERANCE
 
 _NEEDS_RIG = CheckResult("skipped", "needs all cameras with calibration and transform")
 _MOSTLY_MASKED = 0.6
 _MASK_STEP = 4  # pixels of the image for one of the mask's that is looked at
 _PLAUSIBLE_DEPTH = (0.5, 200.0)  # metres
 _FEW_POINTS = 0.01
-_LIDAR_TOLERANCE = 0.1  # seconds
 _MOVING = 0.5  # metres per second
 _ENOUGH_MOTION = 0.2
 
@@ -106,7 +107,7 @@ def _judged_lidars(context: CheckContext, lidars: Sequence[str]) -> CheckResult:
 def _projections(
     context: CheckContext, lidars: Sequence[str], rig: Rig, transforms: TransformTree
 ) -> tuple[dict[str, dict[str, float]], list[str]]:
-    """Return what `_projected` says of each LiDAR, and why there is nothing to say of the others."""
+    """Return the shares of `_projected` by LiDAR, and why the other LiDARs have none."""
     shares: dict[str, dict[str, float]] = {}
     refusals = []
     for topic in lidars:
@@ -125,14 +126,14 @@ def _with_refusals(result: CheckResult, refusals: Sequence[str]) -> CheckResult:
 
 
 def _with_left_out(context: CheckContext, result: CheckResult) -> CheckResult:
-    if not context.clouds_of_cameras:
+    if not context.camera_clouds:
         return result
-    finding = told_of_cameras(context.clouds_of_cameras)
+    finding = describe_camera_clouds(context.camera_clouds)
     return _worsened(result, finding, "name the LiDARs with --lidar, and nothing else is looked at")
 
 
 def _worsened(result: CheckResult, finding: str, remedy: str) -> CheckResult:
-    """Add to what a check found something that is no more than a warning."""
+    """Return a check's result with a further finding that is no more than a warning."""
     status: Status = "failed" if result.status == "failed" else "warning"
     remedy = f"{result.remedy}; {remedy}" if result.remedy else remedy
     return replace(result, status=status, finding=f"{result.finding}; {finding}", remedy=remedy)
@@ -164,13 +165,13 @@ def _projected(context: CheckContext, rig: Rig, topic: str, transforms: Transfor
     for message in context.sweeps[topic]:
         if isinstance(message, RecordingError):
             raise message
-        lidar = LidarSweeps([topic], rig.base_frame, transforms, context.motion, _LIDAR_TOLERANCE)
+        lidar = LidarSweeps([topic], rig.base_frame, transforms, context.motion, LIDAR_TOLERANCE)
         lidar.add(topic, message)
         try:
             return {
-                camera.name: _share_inside(camera, swept.points)
+                camera.name: _share_inside(camera, points)
                 for camera in rig.cameras
-                if (swept := lidar.at(_nearest(context.times(camera.name), stamp_ns(message)))) is not None
+                if (points := lidar.points_at(_nearest(context.times(camera.name), stamp_ns(message)))) is not None
             }
         except TransformError as error:
             refusal = error
@@ -193,7 +194,7 @@ def _share_inside(camera: Camera, points: NDArray[np.float64]) -> float:
 
 
 def check_motion(context: CheckContext) -> CheckResult:
-    """Measure how far and how long the vehicle moves: one that stands gives nothing to learn from."""
+    """Measure how far and how long the vehicle moves: there is nothing to learn from one that stands still."""
     layout = context.layout
     if layout is None:
         return _NEEDS_RIG
@@ -202,7 +203,8 @@ def check_motion(context: CheckContext) -> CheckResult:
         return CheckResult("warning", "motion unknown: neither /tf nor odometry is recorded", remedy)
     times, positions = _track(context, layout.anchor_camera)
     if len(times) < 2:
-        reason = context.motion_problem or f"{context.motion.topic} does not reach the images' stamps"
+        impossible = context.refused_motion.reasons
+        reason = impossible[0] if impossible else f"{context.motion.topic} does not reach the images' stamps"
         return CheckResult("warning", f"motion unknown: {reason}", "stamp poses and images with the same clock")
     steps, seconds = np.linalg.norm(np.diff(positions, axis=0), axis=1), np.diff(times)
     distance, duration = float(steps.sum()), float(seconds.sum())

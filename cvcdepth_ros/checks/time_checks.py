@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from cvcdepth_core.rig.rig_file import RigLayout
+from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_ros.checks.context import CheckContext, CheckResult, Status
 from cvcdepth_ros.recordings.topic_timing import Timing
-from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS, SurroundSet
+from cvcdepth_ros.surround_sets.synchronizer import SurroundSet
 
 _FEW_STEPS_BACK = 0.01
 _ENOUGH_SETS = 0.9
@@ -88,12 +89,12 @@ def _seconds_later(sets: Sequence[SurroundSet[int]], layout: RigLayout) -> dict[
 def _limit(
     context: CheckContext, layout: RigLayout, received: Mapping[str, int], sets: int
 ) -> tuple[str, str, dict[str, Any]]:
-    """Say what keeps sets from forming, what would help, and that in values: clocks, the tolerance, or lost images."""
+    """Return what prevents sets, the remedy, and both as values: clocks, the tolerance, or lost images."""
     offsets = _clock_differences(context, layout)
     shifted = len(context.match(layout, context.options.tolerance, offsets))
     if offsets and shifted > sets:
-        told = ", ".join(f"{name} {offset:+.3f} s" for name, offset in offsets.items())
-        remedy = f"give stamp_offset in a rig file ({told}): {shifted} sets; or set the cameras' clocks alike"
+        listed = ", ".join(f"{name} {offset:+.3f} s" for name, offset in offsets.items())
+        remedy = f"give stamp_offset in a rig file ({listed}): {shifted} sets; or set the cameras' clocks alike"
         proposal = {"limited_by": list(offsets), "stamp_offset": offsets}
         return f"limited by the clock of {', '.join(offsets)}", remedy, proposal
     wide = context.match(layout, max(context.options.tolerance, _period(context, layout)))
@@ -120,7 +121,7 @@ def _limit_by_spread(
 def _clock_differences(context: CheckContext, layout: RigLayout) -> dict[str, float]:
     """Return the stamp offsets of cameras whose clocks differ from the anchor's by more than half a period.
 
-    That is judged by the log times; nearer clocks cannot be told from cameras that fire at another time.
+    That is judged by the log times; a smaller difference may as well be that of cameras that fire at another time.
     """
     found = {c.name: context.timings[c.image_topic].timing().clock_offset for c in layout.cameras}
     clocks = {name: offset.median for name, offset in found.items() if offset is not None}

@@ -61,7 +61,7 @@ class Checked(NamedTuple):
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    tolerance = MatchingSettings.model_fields["tolerance"].default
+    tolerance = MatchingSettings().tolerance
     add_recordings(parser)
     parser.add_argument("--rig", type=Path, metavar="FILE", help="rig file [the cameras found in each recording]")
     parser.add_argument(
@@ -159,9 +159,9 @@ def _verdict(checked: Checked) -> str:
     if checked.unreadable:
         return checked.unreadable
     counts = Counter(result.status for _, _, result in checked.results)
-    told = [f"{counts[status]} {word}" for status, word in _WORDS.items() if counts[status]]
+    counted = [f"{counts[status]} {word}" for status, word in _WORDS.items() if counts[status]]
     failed = f" ({', '.join(checked.failed)})" if checked.failed else ""
-    return f"{', '.join(told)}{failed}"
+    return f"{', '.join(counted)}{failed}"
 
 
 _WORDS: dict["Status", str] = {

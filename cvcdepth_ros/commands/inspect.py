@@ -122,7 +122,7 @@ def _odd_stamps(topics: Sequence["TopicSummary"]) -> Iterator[str]:
     for topic in topics:
         timing = topic.timing
         for count, what in ((timing.steps_back, "step back"), (timing.repeated, "repeat")):
-            # One message of /tf tells the transforms of one sender; those of several need not ascend.
+            # One message of /tf has the transforms of one sender; stamps of several senders need not ascend.
             if count and topic.name != _TRANSFORMS:
                 yield f"  {topic.name}: {count} of {timing.messages} stamps {what}"
 

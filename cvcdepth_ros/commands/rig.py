@@ -13,7 +13,7 @@ from cvcdepth_ros.version import package_version
 if TYPE_CHECKING:
     from cvcdepth_core.rig.rig import Camera, Rig
     from cvcdepth_core.rig.rig_file import RigLayout
-    from cvcdepth_ros.bags import Location
+    from cvcdepth_ros.recordings.rig import RecordedRig
 
 SUMMARY = """Write a rig file from a recording.
 
@@ -44,19 +44,19 @@ def execute(arguments: argparse.Namespace) -> None:
     """Write the rig file and show what is in it."""
     from cvcdepth_core.rig.rig_file import save_rig_layout
     from cvcdepth_ros.bags import open_recording
-    from cvcdepth_ros.recordings.rig import discover_rig
+    from cvcdepth_ros.recordings.rig import RecordedRig
 
     if not arguments.force:
         refuse_to_overwrite(arguments.output)
     with open_recording(arguments.recording) as recording:
-        layout = discover_rig(recording, arguments.base_frame)
+        recorded = RecordedRig.from_recording(recording, base_frame=arguments.base_frame)
+        layout = recorded.layout.model_copy(update={"anchor": _anchor(recorded.layout, arguments.anchor)})
         path = recording.path
-    layout = layout.model_copy(update={"anchor": _anchor(layout, arguments.anchor)})
-    if arguments.masks:
-        folder = arguments.output.parent / f"{arguments.output.stem}_masks"
-        if not arguments.force:
-            refuse_to_overwrite(*(folder / f"{name}.png" for name in layout.names))
-        layout = _with_found_masks(layout, path, folder)
+        if arguments.masks:
+            folder = arguments.output.parent / f"{arguments.output.stem}_masks"
+            if not arguments.force:
+                refuse_to_overwrite(*(folder / f"{name}.png" for name in layout.names))
+            layout = _with_found_masks(recorded.with_layout(layout), folder)
     result = _describe(layout, layout.complete())
     source = f"bag_replay rig {package_version()}, from the recording {path.name}"
     save_rig_layout(arguments.output, layout, f"Written by {source}.\n{_overlaps_text(result)}")
@@ -64,13 +64,13 @@ def execute(arguments: argparse.Namespace) -> None:
     print_result(result, _text(result), arguments.json)
 
 
-def _with_found_masks(layout: "RigLayout", recording: "Location", folder: Path) -> "RigLayout":
+def _with_found_masks(recorded: "RecordedRig", folder: Path) -> "RigLayout":
     from cvcdepth_ros.settings import MatchingSettings
-    from cvcdepth_ros.training_data.index import build_index
+    from cvcdepth_ros.training_data.index import index_recording
     from cvcdepth_ros.training_data.own_body_masks import find_self_occlusion, save_masks
 
-    masks = find_self_occlusion(build_index(recording, MatchingSettings(), layout))
-    return save_masks(layout, masks, folder)
+    masks = find_self_occlusion(index_recording(recorded.completed(), MatchingSettings()))
+    return save_masks(recorded.layout, masks, folder)
 
 
 def _anchor(layout: "RigLayout", wanted: str | None) -> str:
@@ -106,7 +106,7 @@ def _describe(layout: "RigLayout", rig: "Rig") -> dict[str, Any]:
 
 
 def _view(camera: "Camera") -> dict[str, Any]:
-    """Where the camera looks, how widely, and what its pictures are like."""
+    """Return the camera's direction, field of view, and the kind of its pictures."""
     calibration = camera.calibration
     axis = camera.base_T_camera[:3, 2]
     (fx, _, cx), (width, height) = calibration.rectified_intrinsics[0], calibration.image_size

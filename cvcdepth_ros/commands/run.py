@@ -29,10 +29,11 @@ from cvcdepth_ros.settings import MatchingSettings, MissingCameraSettings, Model
 from cvcdepth_ros.version import package_version
 
 if TYPE_CHECKING:
-    from cvcdepth_core.rig.rig_file import RigLayout
     from cvcdepth_ros.bags import Recording
-    from cvcdepth_ros.recordings.replay import DepthReplay, EstimatedSet, SurroundReplay
+    from cvcdepth_ros.recordings.replay import DepthReplay, RecordedImage, SurroundReplay
+    from cvcdepth_ros.recordings.rig import RecordedRig
     from cvcdepth_ros.surround_sets.latencies import StageLatencies
+    from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet
 
 SUMMARY = """Compute depth and clouds into a new recording that Foxglove and RViz open.
 
@@ -82,7 +83,7 @@ def execute(arguments: argparse.Namespace) -> None:
     with open_recording(arguments.recording) as recording:
         from cvcdepth_ros.recordings.replay import DepthReplay, SurroundReplay  # torch: not before there is a recording
 
-        replay = SurroundReplay(recording, _layout(arguments, recording), settings, settings.min_cameras)
+        replay = SurroundReplay(_recorded_rig(arguments, recording), settings, settings.min_cameras)
         with _trace(arguments.trace) as latencies:
             depths = DepthReplay(replay, settings.build_estimator(), latencies)
             outcome = _record(arguments, settings, replay, depths)
@@ -103,7 +104,7 @@ def execute(arguments: argparse.Namespace) -> None:
 
 @contextmanager
 def _trace(path: Path | None) -> "Iterator[StageLatencies]":
-    """Give stage latencies that write a trace, where a file for it is named."""
+    """Yield stage latencies that write a trace, where a file for it is named."""
     from cvcdepth_ros.surround_sets.latencies import StageLatencies
     from cvcdepth_ros.surround_sets.trace_file import TraceFile
 
@@ -115,11 +116,12 @@ def _trace(path: Path | None) -> "Iterator[StageLatencies]":
             trace.close()
 
 
-def _layout(arguments: argparse.Namespace, recording: "Recording") -> "RigLayout":
+def _recorded_rig(arguments: argparse.Namespace, recording: "Recording") -> "RecordedRig":
     from cvcdepth_core.rig.rig_file import load_rig_layout
-    from cvcdepth_ros.recordings.rig import discover_rig
+    from cvcdepth_ros.recordings.rig import RecordedRig
 
-    return load_rig_layout(arguments.rig) if arguments.rig else discover_rig(recording, arguments.base_frame)
+    layout = load_rig_layout(arguments.rig) if arguments.rig else None
+    return RecordedRig.from_recording(recording, layout, arguments.base_frame)
 
 
 def _record(
@@ -149,7 +151,9 @@ def _record(
     return _outcome(replay, depths, written, time.monotonic() - began) | {"interrupted": stop.is_set()}
 
 
-def _with_progress(sets: "Iterator[EstimatedSet]", seconds: float, quiet: bool) -> "Iterator[EstimatedSet]":
+def _with_progress(
+    sets: "Iterator[EstimatedSet[RecordedImage]]", seconds: float, quiet: bool
+) -> "Iterator[EstimatedSet[RecordedImage]]":
     """Show on a terminal how much of the recording is done."""
     from tqdm import tqdm
 
@@ -158,14 +162,14 @@ def _with_progress(sets: "Iterator[EstimatedSet]", seconds: float, quiet: bool) 
     with tqdm(total=seconds, disable=True if quiet else None, bar_format=form, postfix="0 sets") as bar:
         for number, estimated in enumerate(sets, 1):
             yield estimated
-            first = first or estimated.images.stamp_ns
+            first = first or estimated.surround_set.stamp_ns
             bar.set_postfix_str(f"{number} sets", refresh=False)
-            bar.update((estimated.images.stamp_ns - first) / 1e9 - bar.n)
+            bar.update((estimated.surround_set.stamp_ns - first) / 1e9 - bar.n)
 
 
 @contextmanager
 def _stoppable() -> "Iterator[threading.Event]":
-    """Give an event that Ctrl-C or SIGTERM sets, so that the set in hand is still written; a second one interrupts."""
+    """Yield an event that Ctrl-C or SIGTERM sets, so that the set in hand is still written; a second one interrupts."""
     stop = threading.Event()
 
     def handle(*_: object) -> None:

@@ -8,10 +8,10 @@ import torch
 
 from cvcdepth_core.estimator import SurroundDepthEstimator
 from cvcdepth_core.rig.rig_file import RigLayout
+from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_ros.bags import Recording
 from cvcdepth_ros.end_to_end.processes import THREADS_VARIABLE, spared_threads
 from cvcdepth_ros.settings import ModelSettings
-from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS
 
 _MARGIN = 4.0  # player and recorder want their share of the processor, and so may others
 _FASTEST, _SLOWEST_SECONDS = 1.0, 6.0

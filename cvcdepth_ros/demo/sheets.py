@@ -10,12 +10,12 @@ import numpy as np
 from cvcdepth_core.errors import TransformError
 from cvcdepth_core.images.decoding import Picture
 from cvcdepth_core.rig.rig import Rig
+from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_core.visualization import Points, SurroundPictures, contact_sheet
 from cvcdepth_ros.demo.recorded_lidar import RecordedLidar
 from cvcdepth_ros.demo.result import UNTRAINED_WARNING, DemoResult
 from cvcdepth_ros.end_to_end.received import ReceivedSet
 from cvcdepth_ros.reports.animation_page import Table, animation_page
-from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS
 
 _JPEG_QUALITY = 85
 _PNG_COMPRESSION = 6

@@ -43,7 +43,7 @@ def node_outputs(node: str, cameras: Sequence[str], anchor: str) -> list[Output]
 
 def sent_sets(recording: Recording, layout: RigLayout, tolerance: float, sent: Mapping[str, int]) -> list[SentSet]:
     """Return the complete sets among the first `sent[topic]` images of each camera, matched without DDS or haste."""
-    synchroniser: SurroundSynchronizer[int] = SurroundSynchronizer.of_rig(layout, tolerance)
+    synchroniser: SurroundSynchronizer[int] = SurroundSynchronizer.from_layout(layout, tolerance)
     cameras = {camera.image_topic: camera.name for camera in layout.cameras}
     counts: Counter[str] = Counter()
     sets: list[SentSet] = []

@@ -21,7 +21,7 @@ from cvcdepth_core.scoring.scores import ALL, Measurements, Scores, mean
 
 
 class LabelFree(NamedTuple):
-    """What can be said without truth; NaN where nothing could be compared."""
+    """Scores that need no ground truth; NaN where nothing could be compared."""
 
     spatial: float = math.nan
     """Median relative disagreement with the neighbouring cameras, mean over them."""
@@ -62,8 +62,8 @@ class SetScore(NamedTuple):
     label_free: LabelFree
 
     @classmethod
-    def of(cls, number: int, images: Sequence[ImageScore]) -> SetScore:
-        """Take the means over a set's images."""
+    def from_images(cls, number: int, images: Sequence[ImageScore]) -> SetScore:
+        """Return the means over a set's images."""
         means = [_known_mean(values) for values in zip(*(image.label_free for image in images), strict=True)]
         abs_rel = _known_mean([image.metrics["abs_rel"] for image in images])
         return cls(images[0].recording, number, images[0].stamp_ns, abs_rel, LabelFree(*means))
@@ -75,7 +75,7 @@ class SetScore(NamedTuple):
 
 
 def image_scores(scores: Scores, agreement: Sequence[AgreementTable]) -> Iterator[list[ImageScore]]:
-    """Give the scores of each set's images, set by set; `agreement` in the order of the scores' recordings."""
+    """Yield the scores of each set's images, set by set; `agreement` in the order of the scores' recordings."""
     group = scores.settings.groups.index(ALL)
     for table, compared in zip(scores.images, agreement, strict=True):
         label_free = _label_free(compared, len(table), table.cameras)

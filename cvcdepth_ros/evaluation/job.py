@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is to be evaluated, and how: a unit of work that can be sent to another process or machine."""
+"""An evaluation's settings and one recording's job, which can be sent to another process or machine."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from pydantic import Field, model_validator
 
-from cvcdepth_ros.settings import MatchingSettings, ModelSettings
+from cvcdepth_ros.settings import LIDAR_TOLERANCE, MatchingSettings, ModelSettings
 from cvcdepth_ros.version import package_version
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class Dependencies(NamedTuple):
-    """What scores depend on beside recording and configuration."""
+    """The version and checkpoint that scores depend on, beside recording and configuration."""
 
     version: str
     """Of this program."""
@@ -44,7 +44,7 @@ class EvaluationSettings(MatchingSettings, ModelSettings):
     """Metres; truth at or below it is left out, predictions are clamped to it."""
     max_depth: float = Field(80.0, gt=0, le=1e4)
     """Metres; truth at or beyond it is left out, predictions are clamped to it, and label-free scores stop there."""
-    lidar_tolerance: float = Field(0.1, ge=0, le=10)
+    lidar_tolerance: float = Field(LIDAR_TOLERANCE, ge=0, le=10)
     """Seconds that a LiDAR sweep may be from the image that it is the truth of."""
     no_occlusion_filter: bool = False
     """Take every LiDAR point for truth, also those that the camera cannot see behind a nearer surface."""
@@ -59,14 +59,14 @@ class EvaluationSettings(MatchingSettings, ModelSettings):
 
     @property
     def scores(self) -> ScoreSettings:
-        """What is measured."""
+        """Settings of the scorer."""
         from cvcdepth_core.scoring.scores import ScoreSettings
 
         return ScoreSettings(min_depth=self.min_depth, max_depth=self.max_depth)
 
     @property
     def occlusion(self) -> OcclusionFilter | None:
-        """Which LiDAR points are no truth."""
+        """Filter of LiDAR points that the camera cannot see; None where it is switched off."""
         from cvcdepth_core.scoring.sparse_depth import OcclusionFilter
 
         return None if self.no_occlusion_filter else OcclusionFilter()
@@ -78,11 +78,11 @@ class EvaluationSettings(MatchingSettings, ModelSettings):
 
     @property
     def notice(self) -> str:
-        """What must be said of the network's depth."""
+        """Warning about the network's depth; empty where none is needed."""
         return "" if self.predictor else super().notice
 
     def dependencies(self) -> Dependencies:
-        """Look at what this machine has; CheckpointError says what is wrong with the checkpoint."""
+        """Return this machine's version and checkpoint; CheckpointError says what is wrong with the checkpoint."""
         from cvcdepth_core.networks.checkpoint import load_checkpoint
 
         path = self.checkpoint_path
@@ -104,7 +104,7 @@ class EvaluationJob:
     """One recording to evaluate."""
 
     name: str
-    """What results call the recording; unique among those that are evaluated together."""
+    """The recording's name in results; unique among those that are evaluated together."""
     path: str
     settings: EvaluationSettings
     layout: RigLayout | None = None
@@ -112,7 +112,7 @@ class EvaluationJob:
     base_frame: str = "base_link"
     """The vehicle's frame, where `layout` is None."""
     lidar: tuple[str, ...] | None = None
-    """Topics of the LiDARs; none: the vehicle has none; None: all of the recording, see `find_lidars`."""
+    """Topics of the LiDARs; none: the vehicle has none; None: all of the recording, see `RecordedRig.lidars`."""
     start: float = 0.0
     """Seconds of the recording to skip."""
     duration: float | None = None

@@ -7,7 +7,7 @@ import json
 from array import array
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from cvcdepth_core.errors import RecordingError
+from cvcdepth_core.estimator import DepthPredictor
 from cvcdepth_core.rendering.agreement import PosedDepth
 from cvcdepth_core.rig.poses import Pose
 from cvcdepth_core.scoring.consistency import AgreementTable, spatial_rows, temporal_rows
@@ -23,37 +24,38 @@ from cvcdepth_core.scoring.ground_truth import overlap_pixels, sample_prediction
 from cvcdepth_core.scoring.scorer import DepthSamples, SurroundScorer
 from cvcdepth_core.scoring.scores import Scores
 from cvcdepth_core.scoring.sparse_depth import SparseDepth
+from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_core.visualization import Points
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.evaluation.job import EvaluationJob
-from cvcdepth_ros.recordings.replay import DepthReplay, EstimatedSet, SurroundReplay
-from cvcdepth_ros.recordings.rig import discover_rig
+from cvcdepth_ros.recordings.replay import DepthReplay, RecordedImage, SurroundReplay
+from cvcdepth_ros.recordings.rig import RecordedRig
 from cvcdepth_ros.recordings.truth import RecordedTruth
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
-from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS
+from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet
 
 Progress = Callable[[float], None]
-"""Told which share of the recording is done."""
+"""Called with the share of the recording that is done."""
 
 _LONGEST_STEP_NS = NANOSECONDS  # between two sets that are compared along the vehicle's way
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredSet:
-    """One set's depth and what the recording tells of the truth."""
+    """One set's depth and the recording's ground truth for it."""
 
-    estimated: EstimatedSet
+    estimated: EstimatedSet[RecordedImage]
     truth: Sequence[SparseDepth]
     """Of each camera, in the rig's order, at its picture's full size; empty where there is none."""
     world_T_base: Sequence[Pose] | None
-    """The vehicle's pose at each camera's moment; None where the recording does not tell."""
+    """The vehicle's pose at each camera's moment; None where it is not recorded."""
     lidar: Points | None
     """[M, 3] metres in the base frame at the anchor's moment."""
 
     @property
     def stamp_ns(self) -> int:
         """The anchor's stamp."""
-        return self.estimated.images.stamp_ns
+        return self.estimated.surround_set.stamp_ns
 
     @property
     def log_time(self) -> int:
@@ -63,11 +65,11 @@ class MeasuredSet:
     @property
     def posed(self) -> PosedDepth:
         """The depth with the cameras' places."""
-        return PosedDepth.from_rig(self.estimated.depth, self.estimated.rig, self.world_T_base)
+        return PosedDepth.from_rig(self.estimated.result, self.estimated.rig, self.world_T_base)
 
     def samples(self) -> list[DepthSamples]:
         """Return what is scored of each camera."""
-        rig, depth = self.estimated.rig, self.estimated.depth.depth
+        rig, depth = self.estimated.rig, self.estimated.result.depth
         views = {camera.name: camera.rectified_view for camera in rig.cameras}
         found = []
         for name, truth, prediction in zip(rig.names, self.truth, depth, strict=True):
@@ -79,11 +81,11 @@ class MeasuredSet:
 
 @dataclass(frozen=True, eq=False)
 class RecordingScores:
-    """All that was found out about one recording."""
+    """The scores of one recording."""
 
     name: str
     summary: dict[str, Any]
-    """What was read and used, with JSON's types."""
+    """Counts and sources of what was read and used, with JSON's types."""
     scores: Scores
     agreement: AgreementTable
     log_times: NDArray[np.int64]
@@ -117,11 +119,12 @@ class RecordingScores:
 class RecordingEvaluation:
     """One opened recording, ready to be measured; make it with `open_evaluation`."""
 
-    def __init__(self, job: EvaluationJob, replay: SurroundReplay) -> None:
+    def __init__(self, job: EvaluationJob, recorded: RecordedRig, predictor: DepthPredictor | None = None) -> None:
+        """`predictor` is the job's where it is loaded already; without it, it is loaded here."""
         self.job = job
-        self.replay = replay
-        self.truth = RecordedTruth(replay, job.lidar, job.settings.lidar_tolerance)
-        self.depths = DepthReplay(replay, job.settings.build_predictor(replay.rig))
+        self.replay = SurroundReplay(recorded, job.settings)
+        self.truth = RecordedTruth(recorded, job.lidar, job.settings.lidar_tolerance)
+        self.depths = DepthReplay(self.replay, predictor or job.settings.build_predictor(self.replay.rig))
 
     @property
     def window(self) -> tuple[int, int]:
@@ -131,10 +134,10 @@ class RecordingEvaluation:
         return start, end if self.job.duration is None else min(end, start + round(self.job.duration * NANOSECONDS))
 
     def sets(self, start: int, stop: int, stamp_ns: int | None = None) -> Iterator[MeasuredSet]:
-        """Give the sets of start <= log_time < stop (ns), in order; with a stamp, the set of that stamp only."""
+        """Yield the sets of start <= log_time < stop (ns), in order; with a stamp, the set of that stamp only."""
         ahead = self.truth.ahead_ns
         self.truth.read(start - ahead, start)
-        pending: deque[EstimatedSet] = deque()
+        pending: deque[EstimatedSet[RecordedImage]] = deque()
         for estimated in self.depths.sets(start, stop, self.truth.handlers, stamp_ns):
             pending.append(estimated)
             while _log_time(pending[0]) + ahead < _log_time(estimated):
@@ -154,18 +157,28 @@ class RecordingEvaluation:
             raise RecordingError(f"{self.job.path}: no set: {self.depths.why_no_set(*self.window)}")
         return scoring.result(_summary(self, scoring))
 
+    def measured_set(self, stamp_ns: int, log_time: int) -> MeasuredSet:
+        """Measure a single set, which is known by its stamp and log time (ns); RecordingError when it is not there.
+
+        It is matched anew from shortly before it, by the rig and the network of this evaluation.
+        """
+        anew = RecordingEvaluation(self.job, self.replay.recorded, self.depths.estimator)
+        for measured in anew.sets(log_time - 2 * NANOSECONDS, log_time + NANOSECONDS, stamp_ns):
+            return measured
+        raise RecordingError(f"{self.job.path}: no set at {stamp_ns} ns")
+
     @property
     def latencies(self) -> StageLatencies:
-        """Where the time went."""
+        """Durations of the stages."""
         return self.depths.latencies
 
-    def _measured(self, estimated: EstimatedSet) -> MeasuredSet:
-        images, rig = estimated.images, estimated.rig
+    def _measured(self, estimated: EstimatedSet[RecordedImage]) -> MeasuredSet:
+        surround_set, rig = estimated.surround_set, estimated.rig
         with self.latencies.measure("truth"):
-            truth = self.truth.camera_depth(rig, images.times_ns, self.job.settings.occlusion)
-            poses = self.truth.base_poses(rig, images.times_ns)
-            lidar = self.truth.points(images.time_ns)
-            self.truth.forget_before(min(images.times_ns.values()))
+            truth = self.truth.camera_depth(rig, surround_set.times_ns, self.job.settings.occlusion)
+            poses = self.truth.base_poses(rig, surround_set.times_ns)
+            lidar = self.truth.points(surround_set.time_ns)
+            self.truth.forget_before(min(surround_set.times_ns.values()))
         return MeasuredSet(estimated, truth, poses, lidar)
 
 
@@ -173,14 +186,13 @@ class RecordingEvaluation:
 def open_evaluation(job: EvaluationJob) -> Iterator[RecordingEvaluation]:
     """Open the job's recording; the errors of the family name what is missing.
 
-    The network runs in as many CPU threads as the settings say; what torch had before is restored at the end.
+    The network runs in as many CPU threads as the settings name; torch's former number is restored at the end.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(job.settings.threads)
     try:
         with open_recording(job.path) as recording:
-            layout = job.layout or discover_rig(recording, job.base_frame)
-            yield RecordingEvaluation(job, SurroundReplay(recording, layout, job.settings))
+            yield RecordingEvaluation(job, RecordedRig.from_recording(recording, job.layout, job.base_frame))
     finally:
         torch.set_num_threads(threads)
 
@@ -191,12 +203,29 @@ def evaluate_recording(job: EvaluationJob, progress: Progress | None = None) -> 
         return evaluation.scores(progress)
 
 
-def measured_set(job: EvaluationJob, stamp_ns: int, log_time: int) -> MeasuredSet:
-    """Measure one set again, which is known by its stamp and log time (ns); RecordingError when it is not there."""
-    with open_evaluation(job) as evaluation:
-        for measured in evaluation.sets(log_time - 2 * NANOSECONDS, log_time + NANOSECONDS, stamp_ns):
-            return measured
-    raise RecordingError(f"{job.path}: no set at {stamp_ns} ns")
+class Remeasuring:
+    """Measures single sets again; the recording that was asked for last stays open, with its rig and its network.
+
+    Use it as a context manager.
+    """
+
+    def __init__(self) -> None:
+        self._opened = ExitStack()
+        self._evaluation: RecordingEvaluation | None = None
+
+    def __enter__(self) -> Remeasuring:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._opened.close()
+
+    def measured_set(self, job: EvaluationJob, stamp_ns: int, log_time: int) -> MeasuredSet:
+        """Measure a set of a job's recording; see `RecordingEvaluation.measured_set`."""
+        if self._evaluation is None or self._evaluation.job != job:
+            self._evaluation = None
+            self._opened.close()
+            self._evaluation = self._opened.enter_context(open_evaluation(job))
+        return self._evaluation.measured_set(stamp_ns, log_time)
 
 
 class _Scoring:
@@ -271,5 +300,5 @@ def _summary(evaluation: RecordingEvaluation, scoring: _Scoring) -> dict[str, An
     }
 
 
-def _log_time(estimated: EstimatedSet) -> int:
-    return max(image.log_time for image in estimated.images.images.values())
+def _log_time(estimated: EstimatedSet[RecordedImage]) -> int:
+    return max(image.log_time for image in estimated.surround_set.images.values())

@@ -93,7 +93,7 @@ class EvaluationResult:
     def sets(self) -> list[SetScore]:
         """All scores, set by set."""
         numbers = chain.from_iterable(range(len(table)) for table in self.scores.images)
-        return list(map(SetScore.of, numbers, image_scores(self.scores, self.agreement)))
+        return list(map(SetScore.from_images, numbers, image_scores(self.scores, self.agreement)))
 
     def summary(self, protocol: EvaluationProtocol = "image", scaling: Scaling = "metric") -> Summary:
         """Take the means over all recordings."""

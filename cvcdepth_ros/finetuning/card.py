@@ -17,11 +17,11 @@ import torch
 from cvcdepth_core.errors import CvcDepthError
 from cvcdepth_core.files import nan_to_null, write_atomically, write_json
 from cvcdepth_core.networks.checkpoint import load_checkpoint
+from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_ros.bags import file_identities
 from cvcdepth_ros.evaluation.result import EvaluationResult
 from cvcdepth_ros.finetuning.judgement import camera_numbers, numbers_of
 from cvcdepth_ros.finetuning.run import FineTuned
-from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS
 from cvcdepth_ros.training_data.index import RecordingIndex
 from cvcdepth_ros.version import package_version
 
@@ -95,7 +95,7 @@ def _recording(tuned: FineTuned, number: int) -> dict[str, Any]:
         "from": _time(first),
         "seconds": (last - first) / NANOSECONDS,
         "sets": len(index),
-        "outside_of_recorded_motion": index.unplaced,
+        "outside_of_recorded_motion": index.without_motion,
         "training_samples": tuned.samples[number],
         "held_out_sets": _scored_sets(tuned, str(index.path)),
         "cameras": index.layout.names,

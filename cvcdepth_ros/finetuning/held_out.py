@@ -11,14 +11,14 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_core.training.config import TrainingConfig
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings, unique_names
 from cvcdepth_ros.evaluation.result import EvaluationResult
 from cvcdepth_ros.evaluation.workers import KeptParts, evaluate_all
-from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS
 from cvcdepth_ros.training_data.index import RecordingIndex
-from cvcdepth_ros.training_data.samples import first_held_out
+from cvcdepth_ros.training_data.sample_choice import first_held_out
 
 _BAR = "{desc}: {percentage:3.0f}%|{bar}| {n:.1f} of {total} recordings [{elapsed}<{remaining}]"
 _FEWEST_SETS = 2  # the scores along the way need two

@@ -24,7 +24,8 @@ from cvcdepth_ros.finetuning.preparation import Prepared, Source, prepare
 from cvcdepth_ros.finetuning.provenance import inputs_of
 from cvcdepth_ros.finetuning.tensorboard import TensorBoardObserver, has_tensorboard
 from cvcdepth_ros.finetuning.validation import CANDIDATE_FILE, HeldOutValidation
-from cvcdepth_ros.training_data.samples import RecordingBatches, told_beyond_reach
+from cvcdepth_ros.training_data.loader import RecordingBatches
+from cvcdepth_ros.training_data.sample_choice import describe_skipped_samples
 from cvcdepth_ros.version import package_version
 
 START_FILE, BEST_FILE = "start.safetensors", "best.safetensors"
@@ -109,7 +110,7 @@ def fine_tune(order: Order, processes: Processes, tell: Tell) -> FineTuned | Non
 def _tell_of_losses(prepared: Prepared, order: Order, tell: Tell) -> None:
     """Tell what of the recordings is not trained on, and keep it for the report."""
     for index in prepared.indexes:
-        if told := told_beyond_reach(index, order.config.recordings):
+        if told := describe_skipped_samples(index, order.config.recordings):
             prepared.warnings.append(f"{index.path}: {told}")
     for text in (*(f"left out: {reason}" for reason in prepared.left_out.values()), *prepared.warnings):
         tell(text)

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How each camera fares: nothing yet, fine, or why nothing can be made of it, and since when. No ROS here.
+"""The state of each camera: waiting, healthy, or why its images cannot be used. No ROS here.
 
-A camera's images are watched as they arrive; `CameraWatch.condition` is asked by a timer, so that silence is told too.
+A camera's images are watched as they arrive; `CameraWatch.troubles` is polled by a timer, so that silence is noticed
+too.
 """
 
 import math
@@ -24,7 +25,7 @@ _COMPARED_FIRST = 4096  # bytes
 
 
 class CameraState(Enum):
-    """What a camera is doing, the most specific trouble first."""
+    """States of a camera, the most specific trouble first."""
 
     REJECTED = "rejected"
     """Its images, its CameraInfo or its QoS cannot be used."""
@@ -42,11 +43,11 @@ class CameraState(Enum):
 
 @dataclass(frozen=True)
 class CameraCondition:
-    """A camera's state and everything that is known to stand in its way."""
+    """A camera's state with all reasons that are known for it."""
 
     state: CameraState
     reasons: tuple[str, ...] = ()
-    """The one that gave the state first."""
+    """The reason for the state itself first."""
 
     @property
     def text(self) -> str:
@@ -68,7 +69,7 @@ class CameraWatch:
         frozen_after: float,  # s with the same picture; 0: never
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Give a camera that is slower than `stale_after` three of its own intervals instead."""
+        """Watch a camera; one that is slower than `stale_after` is stale after three of its own intervals instead."""
         self._stale_after = stale_after
         self._frozen_after = frozen_after
         self._clock = clock
@@ -105,13 +106,13 @@ class CameraWatch:
             return not frozen
 
     def used(self, refusal: str) -> None:
-        """Note what came of an image: why it could not be used, or nothing when it could."""
+        """Note the outcome of an image: why it could not be used, or an empty string when it could."""
         with self._lock:
             self._refusal = refusal
             self.refused += bool(refusal)
 
     def resume_listening(self) -> None:
-        """Count silence from now on: nobody could take images until now."""
+        """Count silence from now on: images could not be received until now."""
         with self._lock:
             self._listening_since = self._matched_at = self._clock()
 
@@ -122,19 +123,13 @@ class CameraWatch:
             return None if self._received is None else self._clock() - self._received
 
     @property
-    def newest_stamp(self) -> int | None:
-        """The last image's stamp in ns; None before the first."""
-        with self._lock:
-            return None if self._last is None else self._last[0]
-
-    @property
     def interval(self) -> float:
         """Median seconds between its last images; 0 while unknown."""
         with self._lock:
             return self._interval()
 
     def troubles(self) -> list[Trouble]:
-        """Say what its images, or their absence, tell."""
+        """Return what is wrong with its images, their absence included."""
         with self._lock:
             found: list[Trouble] = []
             if self._refusal:
@@ -149,7 +144,7 @@ class CameraWatch:
             return found
 
     def unmatched(self, matched: int, is_explained: bool = False) -> list[Trouble]:
-        """Say whether images come of which none fits a set any more, given how many have become part of one so far.
+        """Return UNMATCHED where images come but none has joined a set lately; `matched` counts those that have so far.
 
         To be asked regularly; `is_explained` when there is another reason for it, which ends at that moment.
         """
@@ -174,7 +169,7 @@ class CameraWatch:
 
 
 def condition(camera: str, troubles: Sequence[Trouble]) -> CameraCondition:
-    """Join what is known of a camera, the most specific first."""
+    """Return the condition that a camera's troubles add up to, the most specific first."""
     order = list(CameraState)
     ranked = sorted(troubles, key=lambda trouble: order.index(trouble[0]))
     if not ranked:

@@ -13,14 +13,15 @@ from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
 from cvcdepth_core.errors import ConfigError
-from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS, SurroundSet
+from cvcdepth_core.stamps import to_nanoseconds
+from cvcdepth_ros.surround_sets.synchronizer import SurroundSet
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class MailboxStatistics:
-    """What became of the sets: received = delivered + replaced + stale + after_close + one that may be waiting."""
+    """Counts of the sets: received = delivered + replaced + stale + after_close + one that may be waiting."""
 
     received: int = 0
     delivered: int = 0
@@ -40,7 +41,7 @@ class Mailbox(Generic[T]):
         """Raise ConfigError if max_age is not a positive number of seconds."""
         if max_age is not None and not (math.isfinite(max_age) and max_age > 0):
             raise ConfigError(f"max_age: expected a positive number of seconds, found {max_age!r}")
-        self._max_age = None if max_age is None else round(max_age * NANOSECONDS)
+        self._max_age = None if max_age is None else to_nanoseconds(max_age)
         self._clock = clock
         self._waiting: SurroundSet[T] | None = None
         self._last_sequence = -1
@@ -50,7 +51,7 @@ class Mailbox(Generic[T]):
 
     @property
     def closed(self) -> bool:
-        """Whether `close` was called: tells a None of `get` from a timeout."""
+        """Whether `close` was called: distinguishes a None of `get` from a timeout."""
         return self._closed
 
     def put(self, surround_set: SurroundSet[T]) -> bool:

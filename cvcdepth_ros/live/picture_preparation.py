@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images become the network's pictures on threads of their own, while their set is still incomplete. No ROS here.
+"""Decoding and rectification on threads of their own, while a set is still incomplete. No ROS here.
 
 Work is only ahead of need, never a backlog: of each camera at most one image waits, the newest, and whoever needs a
 picture that is not ready makes it on the spot.

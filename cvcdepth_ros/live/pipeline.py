@@ -23,25 +23,15 @@ from cvcdepth_core.images.decoding import Picture
 from cvcdepth_core.images.rectifier import Rectifier
 from cvcdepth_core.images.surround import SurroundPreprocessor
 from cvcdepth_core.rig.rig import Rig
-from cvcdepth_core.surround_depth import SurroundDepth
 from cvcdepth_ros.live.camera_states import CameraWatch
 from cvcdepth_ros.live.mailbox import Mailbox
 from cvcdepth_ros.live.picture_preparation import CameraImage, PicturePreparer
 from cvcdepth_ros.messages.conversion import stamp_ns
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
-from cvcdepth_ros.surround_sets.set_estimation import usable_pictures
+from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet, usable_pictures
 from cvcdepth_ros.surround_sets.synchronizer import SurroundSet, SurroundSynchronizer
 
 _JOIN_SECONDS = 1.0
-
-
-@dataclass(frozen=True, eq=False)
-class PublishedSet:
-    """What is handed to be published."""
-
-    images: SurroundSet[CameraImage]
-    rig: Rig
-    depth: SurroundDepth
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,8 +54,8 @@ class SurroundPipeline:
         mailbox: Mailbox[CameraImage],
         watches: Mapping[str, CameraWatch],
         wanted: Callable[[str], bool],
-        publish: Callable[[PublishedSet], None],
-        observe: Callable[[PublishedSet], None],
+        publish: Callable[[EstimatedSet[CameraImage]], None],
+        observe: Callable[[EstimatedSet[CameraImage]], None],
         latencies: StageLatencies,
     ) -> None:
         """Start the threads.
@@ -89,7 +79,7 @@ class SurroundPipeline:
         self._warming = threading.Lock()
         self._warm: DepthPredictor | None = None
         self._preparer = PicturePreparer(len(watches))
-        self._estimates: queue.Queue[PublishedSet | None] = queue.Queue(maxsize=1)
+        self._estimates: queue.Queue[EstimatedSet[CameraImage] | None] = queue.Queue(maxsize=1)
         self.problem = ""
         """Why the last set could not be estimated or published; empty when it could."""
         self.counters = Counter(
@@ -202,8 +192,8 @@ class SurroundPipeline:
         self._estimates.put(None)
 
     def _publish_sets(self) -> None:
-        while (estimate := self._estimates.get()) is not None:
-            self._guard(self._hand_out, estimate)
+        while (estimated := self._estimates.get()) is not None:
+            self._guard(self._hand_out, estimated)
 
     def _guard(self, work: Callable[[Any], None], argument: Any) -> None:
         """One bad set must not end the stream; its reason is kept."""
@@ -237,8 +227,8 @@ class SurroundPipeline:
         self._latencies.record("wait for inference", time.monotonic() - max(received))
         pictures = self._pictures(needed, rectifiers, len(images))
         with self._latencies.measure("inference"), self._pace.measured():
-            depth = surround.estimate([pictures.get(name) for name in rectifiers])
-        self._estimates.put(PublishedSet(surround_set, surround.rig, depth))
+            result = surround.estimate([pictures.get(name) for name in rectifiers])
+        self._estimates.put(EstimatedSet(surround_set, surround.rig, result))
 
     def _needed(self, cameras: Iterable[str], surround: SurroundDepthEstimator) -> list[str]:
         """Return which of the cameras' pictures the network needs for the depth that is wanted.
@@ -268,13 +258,13 @@ class SurroundPipeline:
             self._watches[name].used(str(outcome) if isinstance(outcome, ImageError) else "")
         return usable_pictures(outcomes, cameras, self._synchroniser.required)
 
-    def _hand_out(self, estimate: PublishedSet) -> None:
-        self._publish(estimate)
-        newest = max(image.received for image in estimate.images.images.values())
+    def _hand_out(self, estimated: EstimatedSet[CameraImage]) -> None:
+        self._publish(estimated)
+        newest = max(image.received for image in estimated.surround_set.images.values())
         self._latencies.record("newest image to published", time.monotonic() - newest)
         self.counters["published"] += 1
         self.problem = ""
-        self._observe(estimate)
+        self._observe(estimated)
 
 
 def _surround_of(build: Future[_Build]) -> SurroundDepthEstimator | None:

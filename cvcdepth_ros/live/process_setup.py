@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a process that moves large images over DDS must set up before anything else. Call it first in `main`."""
+"""Setup of a process that moves large images over DDS, to be called first in `main`."""
 
 import ctypes
 import gc
@@ -27,10 +27,10 @@ def prepare_process() -> None:
 
 
 def return_memory() -> None:
-    """Give what is not used any more back to the system, after something large was dropped.
+    """Return unused memory to the system, after something large was dropped.
 
-    Python sees no reason to hurry, for it does not know how much memory a network has outside of it; and glibc was
-    told to keep it (`prepare_process`).
+    Python delays it, for it does not know how much memory a network has outside of it; and glibc was set up to keep
+    it (`prepare_process`).
     """
     gc.collect()
     malloc_trim = getattr(ctypes.CDLL(None), "malloc_trim", None)

@@ -18,7 +18,7 @@ from cvcdepth_core.errors import ConfigError, ImageError, RigError
 from cvcdepth_core.images.decoding import Picture, Reduction, decode_compressed, decode_raw, reduce_picture
 from cvcdepth_core.rig.calibration import Calibration, calibration_from_fields
 from cvcdepth_core.rig.poses import Pose, quaternion_from_rotation
-from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS
+from cvcdepth_core.stamps import NANOSECONDS
 
 _FLOAT32_DATATYPE = 7  # sensor_msgs/PointField.FLOAT32
 _MILLIMETRES = 1000.0

@@ -22,10 +22,10 @@ from rosbags.interfaces import Qos, QosDurability, QosHistory, QosReliability
 from rosgraph_msgs.msg import Clock
 
 from cvcdepth_core.errors import RecordingError
+from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_ros.bags import RecordedMessage, Recording, Topic
 from cvcdepth_ros.messages.camera_discovery import COMPRESSED_IMAGE_TYPE, IMAGE_TYPE
 from cvcdepth_ros.messages.conversion import ros_message_class
-from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS
 
 CLOCK_TOPIC = "/clock"
 

@@ -11,13 +11,11 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from cvcdepth_core.errors import ConfigError
 from cvcdepth_core.pointcloud import CloudLimits
-from cvcdepth_core.rig.rig import Rig
-from cvcdepth_core.surround_depth import SurroundDepth
 from cvcdepth_ros.messages.conversion import ros_message_class, ros_message_factory
 from cvcdepth_ros.node.qos import refusing_impossible_qos
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
 from cvcdepth_ros.surround_sets.output_messages import SurroundMessages, camera_topics, output_types
-from cvcdepth_ros.surround_sets.synchronizer import SurroundSet
+from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet
 
 
 class SurroundOutputs:
@@ -40,17 +38,10 @@ class SurroundOutputs:
         """Whether anybody subscribes something for which this camera's depth is needed."""
         return any(map(self._has_subscribers, camera_topics(camera)))
 
-    def publish(
-        self,
-        surround_set: SurroundSet[Any],
-        depth: SurroundDepth,
-        rig: Rig,
-        frame_ids: Mapping[str, str],
-        limits: CloudLimits,
-    ) -> None:
+    def publish(self, estimated: EstimatedSet[Any], frame_ids: Mapping[str, str], limits: CloudLimits) -> None:
         """Publish one set; see `SurroundMessages.of_set` for stamps and frames."""
         with self._latencies.measure("postprocess"):
-            outputs = list(self._messages.of_set(surround_set, depth, rig, frame_ids, limits, self._has_subscribers))
+            outputs = list(self._messages.of_set(estimated, frame_ids, limits, self._has_subscribers))
         with self._latencies.measure("publish"):
             for output in outputs:
                 self._publishers[output.topic].publish(output.message)

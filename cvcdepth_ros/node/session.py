@@ -12,10 +12,11 @@ from cvcdepth_core.errors import CvcDepthError
 from cvcdepth_core.estimator import DepthEstimator
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.rig_health.overlap_monitor import OverlapMonitor
+from cvcdepth_core.stamps import NANOSECONDS, exposure_times
 from cvcdepth_ros.live.camera_states import CameraCondition, CameraState, CameraWatch, Trouble, condition
 from cvcdepth_ros.live.mailbox import Mailbox
 from cvcdepth_ros.live.picture_preparation import CameraImage
-from cvcdepth_ros.live.pipeline import PublishedSet, SurroundPipeline
+from cvcdepth_ros.live.pipeline import SurroundPipeline
 from cvcdepth_ros.messages.conversion import stamp_ns
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
 from cvcdepth_ros.node.diagnostics import (
@@ -29,7 +30,8 @@ from cvcdepth_ros.node.parameters import NodeParameters, read_parameters
 from cvcdepth_ros.node.publishers import SurroundOutputs
 from cvcdepth_ros.node.subscriptions import CameraInputs, StaticTransformInput
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
-from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS, SurroundSynchronizer
+from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet
+from cvcdepth_ros.surround_sets.synchronizer import SurroundSynchronizer
 from cvcdepth_ros.surround_sets.trace_file import TraceFile
 
 
@@ -50,7 +52,7 @@ class SurroundSession:
         self._estimator = estimator
         self._assembler, layout = assembler, assembler.layout
         self._places: dict[str, bytes] = {}
-        self._synchroniser: SurroundSynchronizer[CameraImage] = SurroundSynchronizer.of_rig(
+        self._synchroniser: SurroundSynchronizer[CameraImage] = SurroundSynchronizer.from_layout(
             layout, parameters.tolerance, parameters.queue_size, parameters.min_cameras
         )
         self._mailbox: Mailbox[CameraImage] = Mailbox(parameters.max_age or None, self._ros_time)
@@ -159,7 +161,7 @@ class SurroundSession:
         self._is_finished = self._pipeline.close()
 
     def _on_image(self, camera: str, message: Any) -> None:
-        taken = stamp_ns(message) - self._offsets_ns[camera]
+        taken = exposure_times(stamp_ns(message), self._offsets_ns[camera])
         self.latencies.record("receive (ROS time)", (self._ros_time() - taken) / NANOSECONDS)
         megabytes = len(message.data) / 1e6
         if megabytes > self._max_image_mb:
@@ -190,18 +192,18 @@ class SurroundSession:
             self._pipeline.set_rig(None)
             self._node.get_logger().error(str(error))
 
-    def _publish(self, published: PublishedSet) -> None:
+    def _publish(self, published: EstimatedSet[CameraImage]) -> None:
         frame_ids = {name: self._assembler.frame_id(name) or "" for name in published.rig.names}
         limits = read_parameters(self._node).cloud_limits
-        self._outputs.publish(published.images, published.depth, published.rig, frame_ids, limits)
-        age = self._ros_time() - max(published.images.times_ns.values())
+        self._outputs.publish(published, frame_ids, limits)
+        age = self._ros_time() - max(published.surround_set.times_ns.values())
         self.latencies.record("age of newest image at publish (ROS time)", age / 1e9)
 
-    def _watch_overlaps(self, published: PublishedSet) -> None:
+    def _watch_overlaps(self, published: EstimatedSet[CameraImage]) -> None:
         if self._overlaps is None or self._monitored_rig is not published.rig:
             self._overlaps, self._monitored_rig = OverlapMonitor(published.rig), published.rig
         with self.latencies.measure("overlap monitor"):
-            self._overlaps.update(published.depth, published.images.stamp_ns)
+            self._overlaps.update(published.result, published.surround_set.stamp_ns)
 
     def _ros_time(self) -> int:
         return int(self._node.get_clock().now().nanoseconds)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a recording says: rig, surround sets, motion, LiDAR, time."""
+"""The content of a recording: rig, surround sets, motion, LiDAR, times."""

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recording of depth: the topics that the node would have published, and transforms to show them. No ROS here."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,30 +10,31 @@ from cvcdepth_core.errors import TransformError
 from cvcdepth_core.rig.poses import Pose
 from cvcdepth_ros.bags import RecordedMessage, RecordingWriter
 from cvcdepth_ros.messages.conversion import bag_message_factory
+from cvcdepth_ros.messages.point_clouds import POINT_CLOUD_TYPE
 from cvcdepth_ros.messages.transforms import TransformTree, frame_name
-from cvcdepth_ros.recordings.replay import EstimatedSet, Handlers, SurroundReplay
-from cvcdepth_ros.recordings.rig import STATIC_TRANSFORMS
+from cvcdepth_ros.recordings.fixed_frames import MOVING_TRANSFORMS, TRANSFORM_TYPE, has_transforms
+from cvcdepth_ros.recordings.replay import Handlers, RecordedImage, SurroundReplay
+from cvcdepth_ros.recordings.rig_messages import STATIC_TRANSFORMS
 from cvcdepth_ros.settings import OutputSettings
 from cvcdepth_ros.surround_sets.output_messages import (
     MERGED_CAMERAS,
     MERGED_CLOUD,
-    POINT_CLOUD_TYPE,
     SurroundMessages,
     output_types,
 )
+from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet
 
 CloudChoice = Literal["merged", "all", "none"]
 
-TRANSFORMS = "/tf"
 _NODE = "/surround_depth"
-_TRANSFORM_TYPE = "tf2_msgs/msg/TFMessage"
 _SAME_POSE = 1e-6  # metres, and elements of the rotation
 
 
 class DepthRecorder:
     """Writes a new rosbag2 folder with the depth of a replayed recording; use it as a context manager.
 
-    Everything lies at the log time of the image that it comes from, so that both recordings can be shown together.
+    Every message has the log time of the image that it was computed from, so that both recordings can be shown
+    together.
     """
 
     def __init__(
@@ -42,8 +42,8 @@ class DepthRecorder:
     ) -> None:
         """Create the folder, announce the topics and write the fixed transforms at the log time `start` (ns).
 
-        Raises RecordingError when the folder exists already, and TransformError when the rig file's poses do not go
-        together with the recording's frames.
+        Raises RecordingError when the folder exists already, and TransformError when the rig file's poses
+        contradict the recording's frames.
         """
         self._replay = replay
         self._settings = settings
@@ -54,10 +54,10 @@ class DepthRecorder:
         self._writer = RecordingWriter(path)
         for topic, type_ in self._topics.items():
             self._writer.add_topic(f"{_NODE}/{topic}", type_)
-        self._writer.add_topic(STATIC_TRANSFORMS, _TRANSFORM_TYPE)
+        self._writer.add_topic(STATIC_TRANSFORMS, TRANSFORM_TYPE)
         self._writer.write(STATIC_TRANSFORMS, start, static_transforms)
         self.handlers = self._moving_transforms()
-        """What to do with the replayed recording's other topics: `/tf` is copied."""
+        """Handlers for the replayed recording's other topics: `/tf` is copied."""
 
     def __enter__(self) -> "DepthRecorder":
         return self
@@ -65,39 +65,32 @@ class DepthRecorder:
     def __exit__(self, *_: object) -> None:
         self._writer.close()
 
-    def write(self, estimated: EstimatedSet) -> None:
+    def write(self, estimated: EstimatedSet[RecordedImage]) -> None:
         """Write one set."""
-        images, limits, frame_ids = estimated.images, self._settings.cloud_limits, self._replay.frame_ids
-        for output in self._messages.of_set(
-            images, estimated.depth, estimated.rig, frame_ids, limits, self._topics.__contains__
-        ):
-            self._writer.write(f"{_NODE}/{output.topic}", images.images[output.camera].log_time, output.message)
+        limits, frame_ids = self._settings.cloud_limits, self._replay.frame_ids
+        for output in self._messages.of_set(estimated, frame_ids, limits, self._topics.__contains__):
+            log_time = estimated.surround_set.images[output.camera].log_time
+            self._writer.write(f"{_NODE}/{output.topic}", log_time, output.message)
 
     def _moving_transforms(self) -> Handlers:
-        moving = self._replay.recording.topics.get(TRANSFORMS)
-        if moving is None or moving.type != _TRANSFORM_TYPE:
+        recording = self._replay.recording
+        if not has_transforms(recording, MOVING_TRANSFORMS):
             return {}
-        self._writer.add_topic(TRANSFORMS, _TRANSFORM_TYPE, moving.qos or ())
-        return {TRANSFORMS: self._copy}
+        self._writer.add_topic(MOVING_TRANSFORMS, TRANSFORM_TYPE, recording.topics[MOVING_TRANSFORMS].qos or ())
+        return {MOVING_TRANSFORMS: self._copy}
 
     def _copy(self, message: RecordedMessage) -> None:
         self._writer.write(message.topic, message.log_time, message.cdr)
 
     def _static_transforms(self, log_time: int) -> Any:
         """Join all fixed transforms to one message: of a latched topic, players and viewers keep the last alone."""
-        links = {frame_name(link.child_frame_id): link for link in self._recorded_links()}
+        links = dict(self._replay.recorded.static_links)
         given = bag_message_factory().static_transforms(log_time, self._replay.layout.base_frame, self._given_poses())
         for link in given.transforms:
             links[frame_name(link.child_frame_id)] = link
         given.transforms = list(links.values())
         TransformTree().add_message(given)  # refuses what is no tree
         return given
-
-    def _recorded_links(self) -> Iterator[Any]:
-        recording = self._replay.recording
-        if STATIC_TRANSFORMS in recording.topics:
-            for message in recording.messages([STATIC_TRANSFORMS]):
-                yield from recording.deserialize(message).transforms
 
     def _given_poses(self) -> dict[str, Pose]:
         """Return the rig file's camera poses that the recording lacks or contradicts, by frame."""
@@ -107,7 +100,7 @@ class DepthRecorder:
 
     def _is_recorded(self, base_frame: str, frame: str, pose: Pose) -> bool:
         try:
-            return np.allclose(self._replay.transforms.lookup(base_frame, frame), pose, atol=_SAME_POSE)
+            return np.allclose(self._replay.recorded.transforms.lookup(base_frame, frame), pose, atol=_SAME_POSE)
         except TransformError:
             return False
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sensors whose fixed poses are on `/tf`, told again and again, as in recordings made of nuScenes. No ROS here."""
+"""Sensors whose fixed poses are on `/tf`, published repeatedly, as in recordings made from nuScenes. No ROS here."""
 
 from __future__ import annotations
 
@@ -11,35 +11,36 @@ import numpy as np
 
 from cvcdepth_core.errors import TransformError
 from cvcdepth_core.rig.poses import Pose, inverse, quaternion_from_rotation
+from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_ros.bags import RecordedMessage, Recording
 from cvcdepth_ros.messages.transforms import TransformTree, frame_name, links_of
 
 MOVING_TRANSFORMS = "/tf"
+TRANSFORM_TYPE = "tf2_msgs/msg/TFMessage"
 
-# A recording may be hours long, on another machine's disk: looked at are so many seconds, spread over it.
-_SECONDS_LOOKED_AT = 20
-_SECOND = 10**9
+# A recording may be hours long, on another machine's disk: so many single seconds, spread over it, are examined.
+_SECONDS_EXAMINED = 20
 # Noise of rounding, and no more: a camera on a sprung cab or a turning head moves by centimetres or degrees.
 _FIXED_METRES, _FIXED_RADIANS = 1e-3, 1e-3
 
 
 @dataclass
 class ObservedLink:
-    """One link of `/tf` over the recording."""
+    """One link of `/tf`, and how far it moves over the recording."""
 
     parent: str
     child: str
     parent_T_child: Pose
-    """[4, 4] as it was told first."""
+    """[4, 4] as it was published first."""
     metres: float = 0.0
-    """The greatest distance from there that was told."""
+    """The greatest distance from that pose."""
     radians: float = 0.0
-    """The greatest turn."""
+    """The greatest rotation from that pose."""
     other_parent: str | None = None
-    """A second parent that was told."""
+    """A second parent that was published for the same child."""
 
     def observe(self, parent: str, parent_T_child: Pose) -> None:
-        """Compare with what is told later."""
+        """Compare with a pose that was published later."""
         if parent != self.parent:
             self.other_parent = parent
             return
@@ -49,13 +50,18 @@ class ObservedLink:
         self.radians = max(self.radians, 2 * math.asin(min(1.0, sine)))
 
     def problem(self) -> str | None:
-        """Say why it is not fixed; None when it is."""
+        """Return why it is not fixed; None when it is."""
         if self.other_parent is not None:
             return f"frame '{self.child}' has two parents, '{self.parent}' and '{self.other_parent}'"
         if self.metres > _FIXED_METRES or self.radians > _FIXED_RADIANS:
             by = f"{self.metres:.3f} m and {math.degrees(self.radians):.2f} degrees"
             return f"{self.parent} <- {self.child} moves during the recording, by up to {by}"
         return None
+
+
+def has_transforms(recording: Recording, topic: str) -> bool:
+    """Whether the topic is recorded and carries transforms."""
+    return topic in recording.topics and recording.topics[topic].type == TRANSFORM_TYPE
 
 
 def observed_links(recording: Recording) -> dict[str, ObservedLink]:
@@ -110,9 +116,9 @@ def _chain(tree: TransformTree, links: Mapping[str, ObservedLink], frame: str, f
 
 def _spread_messages(recording: Recording) -> Iterator[RecordedMessage]:
     duration = recording.end + 1 - recording.start
-    if duration <= _SECONDS_LOOKED_AT * _SECOND:
+    if duration <= _SECONDS_EXAMINED * NANOSECONDS:
         yield from recording.messages([MOVING_TRANSFORMS])
         return
-    for number in range(_SECONDS_LOOKED_AT):
-        start = recording.start + (duration - _SECOND) * number // (_SECONDS_LOOKED_AT - 1)
-        yield from recording.messages([MOVING_TRANSFORMS], start, start + _SECOND)
+    for number in range(_SECONDS_EXAMINED):
+        start = recording.start + (duration - NANOSECONDS) * number // (_SECONDS_EXAMINED - 1)
+        yield from recording.messages([MOVING_TRANSFORMS], start, start + NANOSECONDS)

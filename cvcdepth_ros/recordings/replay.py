@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recording's surround sets and their depth, through the node's own matching, preprocessing and estimator.
 
-No ROS here. `SurroundReplay` gives the sets (for training, say), `DepthReplay` adds the depth. Every set is given:
-there is no clock to keep up with, hence no mailbox.
+No ROS here. `SurroundReplay` gives the sets (for training, say), `DepthReplay` adds the depth. No set is
+skipped: there is no clock to keep up with, hence no mailbox.
 """
 
 import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from itertools import islice
 from typing import Any, NamedTuple
 
@@ -18,17 +17,16 @@ from numpy.typing import NDArray
 from cvcdepth_core.errors import CvcDepthError, RecordingError, RigError
 from cvcdepth_core.estimator import DepthPredictor, SurroundDepthEstimator
 from cvcdepth_core.rig.rig import Rig
-from cvcdepth_core.rig.rig_file import RigLayout
-from cvcdepth_core.surround_depth import SurroundDepth
-from cvcdepth_ros.bags import RecordedMessage, Recording
+from cvcdepth_core.stamps import NANOSECONDS, exposure_times
+from cvcdepth_ros.bags import RecordedMessage
 from cvcdepth_ros.messages.conversion import stamp_ns
-from cvcdepth_ros.messages.transforms import TransformTree
-from cvcdepth_ros.recordings.rig import add_camera_info, assemble_rig
+from cvcdepth_ros.recordings.refusals import Refusals
+from cvcdepth_ros.recordings.rig import RecordedRig
+from cvcdepth_ros.recordings.rig_messages import add_camera_info
 from cvcdepth_ros.settings import MatchingSettings
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
-from cvcdepth_ros.surround_sets.set_estimation import estimate_set
+from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet, estimate_set
 from cvcdepth_ros.surround_sets.synchronizer import (
-    NANOSECONDS,
     SurroundSet,
     SurroundSynchronizer,
     SynchronizerStatistics,
@@ -36,7 +34,6 @@ from cvcdepth_ros.surround_sets.synchronizer import (
 
 Handlers = Mapping[str, Callable[[RecordedMessage], None]]
 
-_KEPT_REASONS = 100
 _IMAGES_TO_EXPLAIN = 1000
 
 
@@ -47,42 +44,24 @@ class RecordedImage(NamedTuple):
     log_time: int
 
 
-class Refusals:
-    """Messages and sets that could not be used: how many, and the first hundred reasons."""
-
-    def __init__(self) -> None:
-        self.count = 0
-        self.reasons: list[str] = []
-
-    def add(self, reason: str) -> None:
-        """Count one more."""
-        self.count += 1
-        if len(self.reasons) < _KEPT_REASONS:
-            self.reasons.append(reason)
-
-    def __str__(self) -> str:
-        return f"{self.count} refused, the first: {self.reasons[0]}" if self.count else "none refused"
-
-
 class SurroundReplay:
     """The surround sets of a recording, matched as the live node would match them."""
 
-    def __init__(
-        self, recording: Recording, layout: RigLayout, matching: MatchingSettings, min_cameras: int = 0
-    ) -> None:
-        """Complete the rig; RecordingError, RigError or TransformError names the first thing that is missing.
+    def __init__(self, recorded: RecordedRig, matching: MatchingSettings, min_cameras: int = 0) -> None:
+        """Match the images of a rig's recording.
 
         `min_cameras` below the rig's number gives sets that lack the images of dead cameras; 0 gives only whole ones.
         """
-        self.recording = recording
-        self.layout = layout
+        self.recorded = recorded
+        self.recording = recorded.recording
+        self.layout = recorded.layout
         self.unreadable = Refusals()
-        """Images and CameraInfo whose bytes are no such message."""
-        self._assembler = assemble_rig(recording, layout)
+        """Images and CameraInfos that cannot be deserialised."""
+        self._assembler = recorded.assembler()
         self._rig: Rig | RigError = self._assembler.rig()
         self._tolerance = matching.tolerance
-        self._synchroniser: SurroundSynchronizer[RecordedImage] = SurroundSynchronizer.of_rig(
-            layout, matching.tolerance, matching.queue_size, min_cameras
+        self._synchroniser: SurroundSynchronizer[RecordedImage] = SurroundSynchronizer.from_layout(
+            self.layout, matching.tolerance, matching.queue_size, min_cameras
         )
 
     @property
@@ -103,19 +82,14 @@ class SurroundReplay:
         return {name: self._assembler.frame_id(name) or "" for name in self.layout.names}
 
     @property
-    def transforms(self) -> TransformTree:
-        """The fixed transforms of the recording."""
-        return self._assembler.transforms
-
-    @property
     def statistics(self) -> SynchronizerStatistics:
-        """What became of the images so far."""
+        """Counts of the images so far: matched, queued, dropped."""
         return self._synchroniser.statistics()
 
     def sets(
         self, start: int | None = None, stop: int | None = None, handlers: Handlers | None = None
     ) -> Iterator[SurroundSet[RecordedImage]]:
-        """Give the sets of the messages with start <= log_time < stop (ns), in order.
+        """Yield the sets of the messages with start <= log_time < stop (ns), in order.
 
         `handlers` are given the messages of further topics in between, at their time; topics that are not in the
         recording are passed over.
@@ -134,7 +108,7 @@ class SurroundReplay:
         yield from self._synchroniser.flush()
 
     def why_no_set(self, start: int | None = None, stop: int | None = None) -> str:
-        """Explain why `sets` gave none: which cameras are silent, or too far apart for the tolerance."""
+        """Return why `sets` yielded none: which cameras are silent, or too far apart for the tolerance."""
         silent = [name for name, camera in self.statistics.cameras.items() if not camera.received]
         if silent:
             return f"no image of camera {', '.join(silent)}"
@@ -150,8 +124,8 @@ class SurroundReplay:
         for message in islice(self.recording.messages(cameras, start, stop), _IMAGES_TO_EXPLAIN):
             camera = cameras[message.topic]
             with suppress(RecordingError):
-                stamp = stamp_ns(self.recording.deserialize(message)) / NANOSECONDS
-                stamps[camera.name].append(stamp - camera.stamp_offset)
+                stamp = stamp_ns(self.recording.deserialize(message))
+                stamps[camera.name].append(exposure_times(stamp, camera.stamp_offset_ns) / NANOSECONDS)
         anchor = np.array(stamps[self.layout.anchor_camera])
         return {name: _median_distance(anchor, np.array(found)) for name, found in stamps.items()}
 
@@ -176,17 +150,8 @@ class SurroundReplay:
                 self._rig = error
 
 
-@dataclass(frozen=True, eq=False)
-class EstimatedSet:
-    """One set with its depth."""
-
-    images: SurroundSet[RecordedImage]
-    rig: Rig
-    depth: SurroundDepth
-
-
 class DepthReplay:
-    """Estimates every set of a replay. A set that cannot be estimated is left out and told in `refused`."""
+    """Estimates every set of a replay. A set that cannot be estimated is left out and counted in `refused`."""
 
     def __init__(
         self, replay: SurroundReplay, estimator: DepthPredictor, latencies: StageLatencies | None = None
@@ -204,22 +169,22 @@ class DepthReplay:
         stop: int | None = None,
         handlers: Handlers | None = None,
         stamp_ns: int | None = None,
-    ) -> Iterator[EstimatedSet]:
-        """Give the sets of `SurroundReplay.sets` with their depth; with a stamp, the set of that stamp only."""
-        for images in self._replay.sets(start, stop, handlers):
-            if stamp_ns not in (None, images.stamp_ns):
+    ) -> Iterator[EstimatedSet[RecordedImage]]:
+        """Yield the sets of `SurroundReplay.sets` with their depth; with a stamp, the set of that stamp only."""
+        for surround_set in self._replay.sets(start, stop, handlers):
+            if stamp_ns not in (None, surround_set.stamp_ns):
                 continue
             try:
                 surround = self._current_surround()
-                messages = {name: image.message for name, image in images.images.items()}
-                depth = estimate_set(messages, surround, self.latencies, self._replay.required)
+                messages = {name: image.message for name, image in surround_set.images.items()}
+                result = estimate_set(messages, surround, self.latencies, self._replay.required)
             except CvcDepthError as error:
-                self.refused.add(f"set at {images.stamp_ns} ns: {error}")
+                self.refused.add(f"set at {surround_set.stamp_ns} ns: {error}")
             else:
-                yield EstimatedSet(images, surround.rig, depth)
+                yield EstimatedSet(surround_set, surround.rig, result)
 
     def why_no_set(self, start: int | None = None, stop: int | None = None) -> str:
-        """Explain why `sets` gave none: what was refused, else what `SurroundReplay.why_no_set` says."""
+        """Return why `sets` yielded none: what was refused, else `SurroundReplay.why_no_set`."""
         for refusals in (self.refused, self._replay.unreadable):
             if refusals.count:
                 return str(refusals)

@@ -1,37 +1,108 @@
 # SPDX-License-Identifier: Apache-2.0
 """The rig of a recording: its cameras found, or a rig file's completed, from CameraInfo, `/tf_static` and `/tf`."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
-from itertools import islice
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 from pydantic import ValidationError
 
-from cvcdepth_core.errors import RecordingError, RigError, TransformError, first_validation_message
+from cvcdepth_core.errors import RecordingError, RigError, first_validation_message
 from cvcdepth_core.rig.rig_file import CameraEntry, RigLayout
 from cvcdepth_ros.bags import Recording
 from cvcdepth_ros.messages.camera_discovery import CAMERA_INFO_TYPE, COMPRESSED_IMAGE_TYPE, IMAGE_TYPE, discover_cameras
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
-from cvcdepth_ros.messages.transforms import TransformTree, frame_name
-from cvcdepth_ros.recordings.fixed_frames import MOVING_TRANSFORMS, add_fixed_frames, observed_links
-from cvcdepth_ros.recordings.lidar import cloud_topics
+from cvcdepth_ros.messages.transforms import TransformTree
+from cvcdepth_ros.recordings.motion import MotionLink, VehicleMotion, find_motion_link
+from cvcdepth_ros.recordings.rig_messages import RigMessages
 
-STATIC_TRANSFORMS = "/tf_static"
 IMAGE_TYPES = (IMAGE_TYPE, COMPRESSED_IMAGE_TYPE)
 
 
-def discover_rig(recording: Recording, base_frame: str = "base_link") -> RigLayout:
-    """Find the recording's cameras and return them complete, ordered around the vehicle from the front one.
+class RecordedRig:
+    """The rig of an opened recording, complete: made once and handed to all that need some of it."""
 
-    Raises RecordingError when there are fewer than two, and RigError or TransformError, naming the recording and the
-    camera, for the first that is not calibrated or has no transform to `base_frame`.
-    """
-    return assemble_rig(recording, discover_layout(recording, base_frame)).completed_layout()
+    def __init__(self, recording: Recording, layout: RigLayout, messages: RigMessages) -> None:
+        """Complete `layout` with what was read for its cameras; see `from_recording`.
+
+        Raises RigError or TransformError, naming the recording and the camera, for the first that stays incomplete.
+        """
+        self.recording = recording
+        self.layout = layout
+        """The cameras: the rig file's, as it describes them, or those found, with calibrations and poses."""
+        self._messages = messages
+        assembler = messages.assembler(layout)
+        for problem in assembler.problems().values():
+            raise RigError(f"{recording.path}: {problem}")
+        self.transforms: TransformTree = assembler.transforms
+        """The fixed transforms."""
+
+    @classmethod
+    def from_recording(
+        cls, recording: Recording, layout: RigLayout | None = None, base_frame: str = "base_link"
+    ) -> RecordedRig:
+        """Return the rig of a rig file, or without one of the cameras found, ordered around the vehicle.
+
+        Raises RecordingError when a topic that the layout needs is not in the recording or is of another type, or fewer
+        than two cameras are found; RigError or TransformError, naming the recording and the camera, for the first that
+        is not calibrated or has no transform to the base frame, which `base_frame` names where there is no layout.
+        """
+        chosen = chosen_layout(recording, layout, base_frame)
+        for problem in topic_problems(recording, chosen):
+            raise RecordingError(f"{recording.path}: {problem}")
+        found = cls(recording, chosen, RigMessages(recording, chosen))
+        return found.completed() if layout is None else found
+
+    def completed(self) -> RecordedRig:
+        """Return the same with all that was collected in its layout, the cameras ordered around the vehicle."""
+        return self.with_layout(self.assembler().completed_layout())
+
+    def with_layout(self, layout: RigLayout) -> RecordedRig:
+        """Return the rig of another layout with the same camera_info topics; nothing is read again."""
+        return RecordedRig(self.recording, layout, self._messages)
+
+    def assembler(self) -> RigAssembler:
+        """Return a new assembler with this rig in it, to which later CameraInfos can be added."""
+        return self._messages.assembler(self.layout)
+
+    @property
+    def static_links(self) -> Mapping[str, Any]:
+        """The last `geometry_msgs/TransformStamped` of `/tf_static` for each child frame."""
+        return self._messages.static_links
+
+    @property
+    def lidars(self) -> tuple[str, ...]:
+        """The topics of the LiDARs: those of all point clouds that were not made from camera images."""
+        return self._messages.lidars
+
+    @property
+    def camera_clouds(self) -> tuple[str, ...]:
+        """The topics with clouds that were made from camera images."""
+        return self._messages.camera_clouds
+
+    def vehicle_motion(self) -> VehicleMotion | None:
+        """Return the vehicle's motion, still to be added message by message; None where none is recorded."""
+        return None if self._motion_link is None else VehicleMotion(self._motion_link)
+
+    @cached_property
+    def _motion_link(self) -> MotionLink | None:
+        return find_motion_link(self.recording, self.layout.base_frame, self.transforms)
+
+
+def discover_rig(recording: Recording, base_frame: str = "base_link") -> RigLayout:
+    """Find the recording's cameras and return them complete; see `RecordedRig.from_recording`."""
+    return RecordedRig.from_recording(recording, base_frame=base_frame).layout
+
+
+def chosen_layout(recording: Recording, layout: RigLayout | None, base_frame: str) -> RigLayout:
+    """Return the rig file's layout where there is one, else that of the cameras found, see `discover_layout`."""
+    return discover_layout(recording, base_frame) if layout is None else layout
 
 
 def discover_layout(recording: Recording, base_frame: str = "base_link") -> RigLayout:
-    """Find the recording's cameras; calibrations and poses are still open.
+    """Return the recording's cameras as they are found by their topics, without calibrations and poses.
 
     Raises RecordingError when there are fewer than two.
     """
@@ -50,7 +121,7 @@ def recorded_cameras(recording: Recording) -> list[CameraEntry]:
 
 
 def topics_without_images(recording: Recording) -> Iterator[str]:
-    """Give the camera_info topics beside which no image was recorded: a rig that is found would silently lack them."""
+    """Yield the camera_info topics without images in their namespace: a rig that is found would silently lack them."""
     seeing = {camera.camera_info_topic for camera in recorded_cameras(recording)}
     for topic in recording.topics.values():
         if topic.type == CAMERA_INFO_TYPE and topic.name not in seeing and not is_of_depth(topic.name):
@@ -58,101 +129,12 @@ def topics_without_images(recording: Recording) -> Iterator[str]:
 
 
 def is_of_depth(topic: str) -> bool:
-    """Say whether a topic's name tells that it is of depth images."""
+    """Whether a topic carries depth images, by its name."""
     return any(part.lower().startswith(("depth", "compresseddepth")) for part in topic.split("/"))
 
 
-def assemble_rig(recording: Recording, layout: RigLayout) -> RigAssembler:
-    """Complete `layout` with each camera's first CameraInfo and the static transforms of the whole recording.
-
-    Raises RecordingError when a topic that the layout needs is not in the recording or is of another type; RigError or
-    TransformError, naming the recording and the camera, for the first that stays incomplete.
-    """
-    for problem in topic_problems(recording, layout):
-        raise RecordingError(f"{recording.path}: {problem}")
-    assembler = collect_rig(recording, layout)
-    for problem in assembler.problems().values():
-        raise RigError(f"{recording.path}: {problem}")
-    return assembler
-
-
-def collect_rig(recording: Recording, layout: RigLayout) -> RigAssembler:
-    """Collect each camera's first CameraInfo and the fixed transforms, as far as they are recorded.
-
-    Transforms are those of `/tf_static`; frames of cameras and LiDARs that are not connected there are looked for on
-    `/tf`, see `add_fixed_frames`. Raises TransformError for transforms that contradict each other, and for a camera
-    that moves.
-    """
-    assembler = RigAssembler(layout)
-    _add_first_camera_infos(assembler, recording)
-    _add_static_transforms(assembler, recording)
-    _add_fixed_frames(assembler, recording)
-    return assembler
-
-
-def add_camera_info(assembler: RigAssembler, topic: str, message: Any) -> bool:
-    """Hand a CameraInfo to every camera of that topic; return whether it says anything new."""
-    cameras = [camera.name for camera in assembler.layout.cameras if camera.camera_info_topic == topic]
-    return True in [assembler.add_camera_info(camera, message) for camera in cameras]
-
-
-def _add_first_camera_infos(assembler: RigAssembler, recording: Recording) -> None:
-    recorded = {topic.name for topic in recording.topics.values() if topic.type == CAMERA_INFO_TYPE}
-    awaited = {camera.camera_info_topic for camera in assembler.layout.cameras} & recorded
-    for message in recording.messages(awaited):
-        if message.topic in awaited:
-            add_camera_info(assembler, message.topic, recording.deserialize(message))
-            awaited.remove(message.topic)
-        if not awaited:
-            return
-
-
-def _add_static_transforms(assembler: RigAssembler, recording: Recording) -> None:
-    if STATIC_TRANSFORMS not in recording.topics:
-        return
-    for message in recording.messages([STATIC_TRANSFORMS]):
-        try:
-            assembler.transforms.add_message(recording.deserialize(message))
-        except TransformError as error:
-            raise TransformError(f"{recording.path}: {STATIC_TRANSFORMS}: {error}") from error
-
-
-def _add_fixed_frames(assembler: RigAssembler, recording: Recording) -> None:
-    if MOVING_TRANSFORMS not in recording.topics:
-        return
-    tree, base_frame = assembler.transforms, assembler.layout.base_frame
-    open_cameras = [camera.name for camera in assembler.layout.cameras if camera.base_T_camera is None]
-    cameras = _unconnected(tree, base_frame, [assembler.frame_id(name) or "" for name in open_cameras])
-    lidars = _unconnected(tree, base_frame, [*_lidar_frames(recording)])
-    if not cameras and not lidars:
-        return
-    try:
-        links = observed_links(recording)
-        assembler.frames_on_tf += add_fixed_frames(tree, links, base_frame, cameras)
-    except TransformError as error:
-        raise TransformError(f"{recording.path}: {error}") from error
-    for lidar in lidars:
-        try:
-            assembler.frames_on_tf += add_fixed_frames(tree, links, base_frame, [lidar])
-        except TransformError as error:  # without it there is less truth, no less depth
-            tree.refused[frame_name(lidar)] = str(error)
-
-
-def _unconnected(tree: TransformTree, base_frame: str, frames: Sequence[str]) -> list[str]:
-    root = tree.ancestors(base_frame)[-1]
-    return [frame for frame in frames if tree.ancestors(frame)[-1] != root]
-
-
-def _lidar_frames(recording: Recording) -> Iterator[str]:
-    """Give the frame of each LiDAR's first sweep that can be read."""
-    for topic in cloud_topics(recording):
-        for message in islice(recording.messages([topic]), 1):
-            with suppress(RecordingError):
-                yield recording.deserialize(message).header.frame_id
-
-
 def topic_problems(recording: Recording, layout: RigLayout) -> Iterator[str]:
-    """Say what is wrong with the topics that the cameras need, camera by camera."""
+    """Yield what is wrong with the topics that the cameras need, camera by camera."""
     for camera in layout.cameras:
         problem = _topic_problem(recording, camera.image_topic, IMAGE_TYPES)
         if problem is None and (camera.calibration is None or camera.frame_id is None):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is in a recording: its files, topics with their times, and cameras. No ROS here."""
+"""A summary of a recording: its files, topics with their times, and cameras. No ROS here."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import Any, Literal
 from cvcdepth_core.errors import RecordingError, RigError
 from cvcdepth_core.rig.calibration import Calibration
 from cvcdepth_core.rig.rig_file import CameraEntry
+from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_ros.bags import RecordedMessage, Recording
 from cvcdepth_ros.bags.topics import RecordingFile
 from cvcdepth_ros.messages.conversion import calibration_from_message
 from cvcdepth_ros.recordings.rig import recorded_cameras
 from cvcdepth_ros.recordings.topic_timing import Timing, TopicTiming
-from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS
 
 IndexState = Literal["intact", "rebuilt", "damaged"]
 Progress = Callable[[int], None]

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.typesys.store import Typestore
 
+from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_ros.bags import RecordedMessage
-from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS
+from cvcdepth_ros.recordings.fixed_frames import TRANSFORM_TYPE
 
 _GAP = 2.0  # times the median interval
 _HEADER = "std_msgs/msg/Header"
-_TRANSFORMS = "tf2_msgs/msg/TFMessage"
-# A CDR message begins with four bytes, of which the second tells the byte order; then comes the first field.
+# A CDR message begins with four bytes, the second of which is the byte order; then comes the first field.
 _LITTLE_ENDIAN, _BIG_ENDIAN = struct.Struct("<iI"), struct.Struct(">iI")
 _FIRST_FIELD = 4
 
@@ -30,7 +30,7 @@ class StampReader:
         _, fields = store.fielddefs.get(type_, ([], []))
         is_stamped = bool(fields) and fields[0][1][1] == _HEADER
         # A TFMessage begins with its number of transforms; the first one's header follows.
-        self._offset = _FIRST_FIELD if is_stamped else 2 * _FIRST_FIELD if type_ == _TRANSFORMS else None
+        self._offset = _FIRST_FIELD if is_stamped else 2 * _FIRST_FIELD if type_ == TRANSFORM_TYPE else None
 
     def __call__(self, cdr: bytes | memoryview) -> int | None:
         """Return the stamp, ns; None for a type that has none, and for a message too short to hold one."""

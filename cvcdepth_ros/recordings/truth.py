@@ -7,42 +7,48 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from cvcdepth_core.errors import CvcDepthError, RecordingError, TransformError
+from cvcdepth_core.errors import RecordingError, TransformError
 from cvcdepth_core.rig.poses import Pose
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.scoring.ground_truth import sparse_depth
 from cvcdepth_core.scoring.sparse_depth import OcclusionFilter, SparseDepth
+from cvcdepth_core.stamps import to_nanoseconds
 from cvcdepth_core.visualization import Points
 from cvcdepth_ros.bags import RecordedMessage
-from cvcdepth_ros.recordings.lidar import CLOUD_TYPE, LidarSweeps, VehicleMotion, cloud_topics, find_lidars
-from cvcdepth_ros.recordings.replay import Refusals, SurroundReplay
-from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS
+from cvcdepth_ros.messages.point_clouds import POINT_CLOUD_TYPE
+from cvcdepth_ros.recordings.lidar import LidarSweeps
+from cvcdepth_ros.recordings.refusals import Refusals
+from cvcdepth_ros.recordings.rig import RecordedRig
+from cvcdepth_ros.recordings.rig_messages import cloud_topics
+from cvcdepth_ros.settings import LIDAR_TOLERANCE
 
 _LATE_NS = 300_000_000
 """By how much later than its stamp a sweep or a pose is recorded, at most."""
 
 
 class RecordedTruth:
-    """What a recording knows of depth beside its pictures.
+    """Ground truth for depth from a recording's LiDARs, and the poses from its motion.
 
     Hand `handlers` to the replay. A set's truth is complete once messages up to `ahead_ns` after it were read.
     """
 
-    def __init__(self, replay: SurroundReplay, lidar: Sequence[str] | None, tolerance: float) -> None:
-        """`lidar` names the topics (None: see `find_lidars`), `tolerance` is in seconds; see `LidarSweeps`.
+    def __init__(
+        self, recorded: RecordedRig, lidar: Sequence[str] | None = None, tolerance: float = LIDAR_TOLERANCE
+    ) -> None:
+        """`lidar` names the topics (None: `RecordedRig.lidars`), `tolerance` is in seconds; see `LidarSweeps`.
 
         Raises RecordingError for a topic that is not there or carries no point clouds.
         """
-        self._recording, base_frame = replay.recording, replay.layout.base_frame
-        self.topics, self.left_out = (
-            find_lidars(self._recording) if lidar is None else (tuple(map(self._checked, lidar)), ())
-        )
-        """The LiDARs' topics, and those with clouds that come from cameras."""
-        self.motion = VehicleMotion.find(self._recording, base_frame, replay.transforms)
+        self._recording = recorded.recording
+        self.topics = recorded.lidars if lidar is None else tuple(map(self._checked, lidar))
+        """The LiDARs' topics."""
+        self.left_out = recorded.camera_clouds if lidar is None else ()
+        """Topics with clouds that come from cameras."""
+        self.motion = recorded.vehicle_motion()
         self.refused = Refusals()
-        """Sweeps and moments that are no use, and why."""
-        self._sweeps = LidarSweeps(self.topics, base_frame, replay.transforms, self.motion, tolerance)
-        self._tolerance_ns = round(tolerance * NANOSECONDS)
+        """Sweeps, poses and moments that cannot be used, and why."""
+        self._sweeps = LidarSweeps(self.topics, recorded.layout.base_frame, recorded.transforms, self.motion, tolerance)
+        self._tolerance_ns = to_nanoseconds(tolerance)
         self.ahead_ns = self._tolerance_ns + _LATE_NS
         self.handlers: Mapping[str, Callable[[RecordedMessage], None]] = {
             **dict.fromkeys(self.topics, self._add_sweep),
@@ -50,18 +56,17 @@ class RecordedTruth:
         }
 
     def read(self, start: int, stop: int) -> None:
-        """Take in the messages with start <= log_time < stop (ns), without those of the cameras."""
+        """Add the sweeps and poses of the messages with start <= log_time < stop (ns)."""
         for message in self._recording.messages(self.handlers, start, stop):
             self.handlers[message.topic](message)
 
     def points(self, time: int) -> Points | None:
-        """Return what the LiDARs saw nearest to a moment (ns), [M, 3] metres in the base frame then; None: nothing."""
+        """Return the LiDARs' points nearest to a moment (ns), [M, 3] metres in the base frame then, or None."""
         try:
-            swept = self._sweeps.at(time) if self.topics else None
+            return self._sweeps.points_at(time)
         except TransformError as error:
             self.refused.add(str(error))
             return None
-        return None if swept is None else swept.points
 
     def camera_depth(self, rig: Rig, times: Mapping[str, int], occlusion: OcclusionFilter | None) -> list[SparseDepth]:
         """Return each camera's true depth at the moment of its picture (ns), at full size; empty where unknown."""
@@ -90,21 +95,19 @@ class RecordedTruth:
 
     def _checked(self, topic: str) -> str:
         found = self._recording.topics.get(topic)
-        if found is None or found.type != CLOUD_TYPE:
+        if found is None or found.type != POINT_CLOUD_TYPE:
             there = ", ".join(cloud_topics(self._recording)) or "none"
             what = "no such topic" if found is None else f"carries {found.type}"
-            raise RecordingError(f"{self._recording.path}: LiDAR {topic}: {what}; topics of {CLOUD_TYPE}: {there}")
+            raise RecordingError(
+                f"{self._recording.path}: LiDAR {topic}: {what}; topics of {POINT_CLOUD_TYPE}: {there}"
+            )
         return topic
 
     def _add_sweep(self, message: RecordedMessage) -> None:
-        try:
+        with self.refused.instead_of_errors():
             self._sweeps.add(message.topic, self._recording.deserialize(message))
-        except CvcDepthError as error:
-            self.refused.add(str(error))
 
     def _add_motion(self, message: RecordedMessage) -> None:
-        try:
+        with self.refused.instead_of_errors():
             if self.motion is not None:
                 self.motion.add(self._recording.deserialize(message))
-        except CvcDepthError as error:
-            self.refused.add(str(error))

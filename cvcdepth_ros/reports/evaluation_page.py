@@ -21,7 +21,7 @@ from cvcdepth_core.scoring.scores import SCALINGS, Score
 from cvcdepth_core.visualization import DepthScale
 from cvcdepth_ros.evaluation.image_scores import SetScore, correlations
 from cvcdepth_ros.evaluation.job import EvaluationJob
-from cvcdepth_ros.evaluation.measuring import measured_set
+from cvcdepth_ros.evaluation.measuring import Remeasuring
 from cvcdepth_ros.evaluation.result import PROTOCOLS, EvaluationResult
 from cvcdepth_ros.reports import evaluation_figures as figures
 from cvcdepth_ros.reports.evaluation_pictures import GREATEST_ERROR, SetPictures, draw_set, error_colours
@@ -50,7 +50,9 @@ class ShownSet(NamedTuple):
 
 def write_report(path: Path, result: EvaluationResult, jobs: Mapping[str, EvaluationJob]) -> None:
     """Write the page; the jobs, by recording, are there to measure the sets again that it shows."""
-    shown = [_shown(title, score, result, jobs[score.recording]) for title, score in chosen_sets(result.sets)]
+    chosen = chosen_sets(result.sets)
+    with Remeasuring() as again:
+        shown = [_shown(title, score, result, jobs[score.recording], again) for title, score in chosen]
     write_atomically(path, render(result, shown).encode())
 
 
@@ -89,18 +91,20 @@ def render(result: EvaluationResult, shown: Sequence[ShownSet]) -> str:
     )
 
 
-def _shown(title: str, score: SetScore, result: EvaluationResult, job: EvaluationJob) -> ShownSet:
+def _shown(title: str, score: SetScore, result: EvaluationResult, job: EvaluationJob, again: Remeasuring) -> ShownSet:
     try:
-        pictures = drawn_again(title, score, result, job)
+        pictures = drawn_again(title, score, result, job, again)
     except (CvcDepthError, OSError) as error:
         return ShownSet(title, score, None, str(error))
     return ShownSet(title, score, pictures, "")
 
 
-def drawn_again(title: str, score: SetScore, result: EvaluationResult, job: EvaluationJob) -> SetPictures:
+def drawn_again(
+    title: str, score: SetScore, result: EvaluationResult, job: EvaluationJob, again: Remeasuring
+) -> SetPictures:
     """Measure a set of a result once more, for its pictures; the errors of the family say why that is not possible."""
     recording = next(found for found in result.recordings if found.name == score.recording)
-    measured = measured_set(job, score.stamp_ns, int(recording.log_times[score.number]))
+    measured = again.measured_set(job, score.stamp_ns, int(recording.log_times[score.number]))
     return draw_set(measured, f"{title}: {score.recording}", job.settings.max_depth)
 
 

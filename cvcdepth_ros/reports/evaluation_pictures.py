@@ -63,10 +63,10 @@ def draw_set(measured: MeasuredSet, title: str, far: float) -> SetPictures:
     """Draw one set; colours of depth end at `far` metres."""
     scale = DepthScale(far=far)
     estimated = measured.estimated
-    xyzc = merged_cloud(estimated.depth, estimated.rig, CloudLimits(_CLOUD.stride, _CLOUD.min_range, far))
+    xyzc = merged_cloud(estimated.result, estimated.rig, CloudLimits(_CLOUD.stride, _CLOUD.min_range, far))
     shown = SurroundPictures(
-        estimated.depth.pictures,
-        estimated.depth.depth,
+        estimated.result.pictures,
+        estimated.result.depth,
         ColouredPoints(xyzc[:, :3], _unpacked_rgb(xyzc[:, 3])),
         measured.lidar,
         title,
@@ -95,7 +95,7 @@ def _error_colours(truth: SparseDepth, prediction: NDArray[np.float32]) -> Colou
 
 
 def _tiles(measured: MeasuredSet, colours: Callable[[SparseDepth, NDArray[np.float32]], Colours]) -> list[list[Tile]]:
-    rig, depth = measured.estimated.rig, measured.estimated.depth.depth
+    rig, depth = measured.estimated.rig, measured.estimated.result.depth
     rows = []
     for names in viewing_rows(rig):
         tiles = []
@@ -113,7 +113,7 @@ def _rectified(measured: MeasuredSet, camera: Camera) -> Picture:
     width, height = camera.calibration.image_size
     tile_height = round(_TILE_WIDTH * height / width)
     rectifier = Rectifier(camera.calibration, tile_height, _TILE_WIDTH, camera.rectified)
-    message = measured.estimated.images.images[camera.name].message
+    message = measured.estimated.surround_set.images[camera.name].message
     return rectifier(picture_from_message(message, camera.name), camera.name)
 
 

@@ -17,6 +17,7 @@ from cvcdepth_core.files import write_atomically
 from cvcdepth_core.training.run_folder import LOG_FILE
 from cvcdepth_ros.evaluation.image_scores import SetScore
 from cvcdepth_ros.evaluation.job import EvaluationJob
+from cvcdepth_ros.evaluation.measuring import Remeasuring
 from cvcdepth_ros.evaluation.result import EvaluationResult
 from cvcdepth_ros.finetuning.card import SCORE_TITLES
 from cvcdepth_ros.finetuning.run import START_FILE, FineTuned
@@ -92,7 +93,8 @@ def _shown(title: str, before: SetScore, after: SetScore, tuned: FineTuned, job:
 
 def _drawn(title: str, job: EvaluationJob, weights: Path, result: EvaluationResult, score: SetScore) -> SetPictures:
     settings = job.settings.model_copy(update={"checkpoint": str(weights)})
-    return drawn_again(title, score, result, replace(job, settings=settings))
+    with Remeasuring() as again:
+        return drawn_again(title, score, result, replace(job, settings=settings), again)
 
 
 def _masks(tuned: FineTuned) -> dict[str, bytes]:

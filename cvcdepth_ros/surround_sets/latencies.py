@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a set's time goes: the last durations of each named stage, and their percentiles. No ROS here."""
+"""Durations of the stages that a set passes: the last ones of each, and their percentiles. No ROS here."""
 
 import threading
 import time
@@ -19,7 +19,7 @@ _WINDOW = 1000
 
 @dataclass(frozen=True)
 class StageSummary:
-    """How long one stage took: milliseconds over the last sets, and seconds over all of them."""
+    """Durations of one stage: milliseconds over the last sets, and seconds over all of them."""
 
     count: int
     p50_ms: float

@@ -10,9 +10,9 @@ from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.surround_depth import SurroundDepth
 from cvcdepth_ros.messages.camera_discovery import CAMERA_INFO_TYPE, IMAGE_TYPE
 from cvcdepth_ros.messages.conversion import MessageFactory
-from cvcdepth_ros.surround_sets.synchronizer import SurroundSet
+from cvcdepth_ros.messages.point_clouds import POINT_CLOUD_TYPE
+from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet
 
-POINT_CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
 STRING_TYPE = "std_msgs/msg/String"
 
 MERGED_CLOUD = "points"
@@ -56,9 +56,7 @@ class SurroundMessages:
 
     def of_set(
         self,
-        surround_set: SurroundSet[Any],
-        depth: SurroundDepth,
-        rig: Rig,
+        estimated: EstimatedSet[Any],
         frame_ids: Mapping[str, str],
         limits: CloudLimits,
         wanted: Callable[[str], object],
@@ -68,35 +66,36 @@ class SurroundMessages:
         What belongs to one camera carries that camera's own stamp (ns) and optical frame, so that it matches the input
         image exactly; the merged cloud carries the stamp of the set's anchor and the base frame.
         """
+        surround_set, rig, result = estimated.surround_set, estimated.rig, estimated.result
         for index, camera in enumerate(rig.names):
-            if depth.present[index]:
+            if result.present[index]:
                 stamp = surround_set.stamps_ns[camera]
-                for part, build in self._camera_messages(depth, index, stamp, frame_ids[camera]).items():
+                for part, build in self._camera_messages(result, index, stamp, frame_ids[camera]).items():
                     if wanted(f"{camera}/{part}"):
                         yield OutputMessage(f"{camera}/{part}", camera, build())
-        for topic, build in self._merged_messages(surround_set.stamp_ns, depth, rig, limits).items():
+        for topic, build in self._merged_messages(surround_set.stamp_ns, result, rig, limits).items():
             if wanted(topic):
                 yield OutputMessage(topic, surround_set.anchor, build())
 
     def _merged_messages(
-        self, stamp: int, depth: SurroundDepth, rig: Rig, limits: CloudLimits
+        self, stamp: int, result: SurroundDepth, rig: Rig, limits: CloudLimits
     ) -> dict[str, Callable[[], Any]]:
         """Return how to build each of the messages about all cameras together."""
-        contained = [name for name, present in zip(rig.names, depth.present, strict=True) if present]
+        contained = [name for name, present in zip(rig.names, result.present, strict=True) if present]
         description = {"stamp": stamp, "frame_id": rig.base_frame, "cameras": contained}
         return {
-            MERGED_CLOUD: lambda: self._factory.point_cloud(stamp, rig.base_frame, merged_cloud(depth, rig, limits)),
+            MERGED_CLOUD: lambda: self._factory.point_cloud(stamp, rig.base_frame, merged_cloud(result, rig, limits)),
             MERGED_CAMERAS: lambda: self._factory.string(json.dumps(description)),
         }
 
     def _camera_messages(
-        self, depth: SurroundDepth, index: int, stamp: int, frame_id: str
+        self, result: SurroundDepth, index: int, stamp: int, frame_id: str
     ) -> dict[str, Callable[[], Any]]:
         """Return how to build each of one camera's messages."""
-        metres, intrinsics, picture = depth.depth[index], depth.intrinsics[index], depth.pictures[index]
+        metres, intrinsics, picture = result.depth[index], result.intrinsics[index], result.pictures[index]
         return {
             DEPTH: lambda: self._factory.depth_image(stamp, frame_id, metres, self._encoding),
             DEPTH_INFO: lambda: self._factory.camera_info(stamp, frame_id, intrinsics, *metres.shape),
             PICTURE: lambda: self._factory.colour_image(stamp, frame_id, picture),
-            CLOUD: lambda: self._factory.point_cloud(stamp, frame_id, organised_cloud(depth, index)),
+            CLOUD: lambda: self._factory.point_cloud(stamp, frame_id, organised_cloud(result, index)),
         }

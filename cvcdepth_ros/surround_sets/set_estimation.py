@@ -2,18 +2,34 @@
 """From the image messages of one set to depth, for the bag tool and the evaluation, and the live node's part of it."""
 
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
 
 from cvcdepth_core.errors import ImageError
 from cvcdepth_core.estimator import SurroundDepthEstimator
 from cvcdepth_core.images.decoding import Picture
 from cvcdepth_core.images.rectifier import Rectifier
+from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.surround_depth import SurroundDepth
 from cvcdepth_ros.messages.conversion import picture_from_message
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
+from cvcdepth_ros.surround_sets.synchronizer import SurroundSet
+
+T = TypeVar("T")
 
 Outcome = Picture | ImageError
-"""What became of an image: the network's picture, or why there is none."""
+"""Result of preparing one image: the network's picture, or why there is none."""
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatedSet(Generic[T]):
+    """A surround set, its depth, and the rig that it was estimated with."""
+
+    surround_set: SurroundSet[T]
+    rig: Rig
+    """As it was at this set: calibrations may change meanwhile."""
+    result: SurroundDepth
+    """Arrays in the order of the rig's cameras."""
 
 
 def estimate_set(
@@ -21,7 +37,7 @@ def estimate_set(
 ) -> SurroundDepth:
     """Decode, rectify and estimate the image messages of one set, by camera; those that are damaged are left out.
 
-    ImageError says what is wrong with them when fewer than `required` images are left.
+    Raises ImageError, naming what is wrong with them, when fewer than `required` images are left.
     """
     rectifiers = surround.preprocessor.rectifiers
     outcomes = {

@@ -48,13 +48,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 from cvcdepth_core.errors import ConfigError
+from cvcdepth_core.stamps import exposure_times, to_nanoseconds
+from cvcdepth_ros.settings import MatchingSettings
 
 if TYPE_CHECKING:
     from cvcdepth_core.rig.rig_file import RigLayout
 
 T = TypeVar("T")
 
-NANOSECONDS = 1_000_000_000
+_DEFAULTS = MatchingSettings()
 _INTERVALS_FOR_PERIOD = 9
 _BEHIND_IN_A_ROW = 3
 _PATIENCE_PERIODS = 3
@@ -80,7 +82,7 @@ class SurroundSet(Generic[T]):
 
 @dataclass(frozen=True)
 class CameraStatistics:
-    """What became of one camera's images: received = matched + queued + the sum of dropped."""
+    """Counts of one camera's images: received = matched + queued + the sum of dropped."""
 
     received: int
     matched: int
@@ -113,7 +115,7 @@ class SurroundSynchronizer(Generic[T]):
         anchor: str,
         tolerance: float,  # s, largest difference between any two corrected stamps of a set
         offsets: Mapping[str, float] | None = None,  # s, camera -> subtracted from its stamps; 0 where not given
-        queue_size: int = 10,  # images per camera
+        queue_size: int = _DEFAULTS.queue_size,  # images per camera
         clock_jump: float = 1.0,  # s, a stamp this much behind its camera's newest is a clock step
         min_cameras: int = 0,  # images without which no set leaves; 0: one of every camera
     ) -> None:
@@ -128,11 +130,11 @@ class SurroundSynchronizer(Generic[T]):
             )
         self.required = min_cameras or len(cameras)
         """Images without which no set leaves."""
-        self._tolerance = _to_nanoseconds("tolerance", tolerance, minimum=0.0)
-        clock_jump_ns = _to_nanoseconds("clock_jump", clock_jump, minimum=tolerance)
+        self._tolerance = _checked_nanoseconds("tolerance", tolerance, minimum=0.0)
+        clock_jump_ns = _checked_nanoseconds("clock_jump", clock_jump, minimum=tolerance)
         self._streams: dict[str, _Stream[T]] = {}
         for camera in cameras:
-            offset = _to_nanoseconds(f"offsets[{camera!r}]", (offsets or {}).get(camera, 0.0))
+            offset = _checked_nanoseconds(f"offsets[{camera!r}]", (offsets or {}).get(camera, 0.0))
             self._streams[camera] = _Stream(offset, queue_size, clock_jump_ns)
         self._anchor = anchor
         self._acting_anchor = anchor
@@ -142,8 +144,8 @@ class SurroundSynchronizer(Generic[T]):
         self._lock = threading.Lock()
 
     @classmethod
-    def of_rig(
-        cls, layout: "RigLayout", tolerance: float, queue_size: int = 10, min_cameras: int = 0
+    def from_layout(
+        cls, layout: "RigLayout", tolerance: float, queue_size: int = _DEFAULTS.queue_size, min_cameras: int = 0
     ) -> "SurroundSynchronizer[T]":
         """Match the cameras of a rig with its anchor and its stamp offsets; the rest as in the constructor."""
         offsets = {camera.name: camera.stamp_offset for camera in layout.cameras}
@@ -159,7 +161,7 @@ class SurroundSynchronizer(Generic[T]):
             raise ConfigError(f"camera: {camera!r} is not one of {', '.join(self._streams)}")
         with self._lock:
             self._arrivals += 1
-            stream.accept(stamp_ns - stream.offset, image, self._arrivals)
+            stream.accept(exposure_times(stamp_ns, stream.offset), image, self._arrivals)
             return self._decide(final=False)
 
     def flush(self) -> list[SurroundSet[T]]:
@@ -196,7 +198,7 @@ class SurroundSynchronizer(Generic[T]):
         return sets
 
     def _appoint_anchor(self) -> None:
-        """Let another camera stand in for an anchor that is missing, and the anchor return when it is there."""
+        """Replace an anchor that is missing by another camera, until it returns."""
         if self.required == len(self._streams):
             return
         candidates = (self._anchor, *self._streams)
@@ -266,7 +268,7 @@ class SurroundSynchronizer(Generic[T]):
 
 
 class _Stream(Generic[T]):
-    """One camera's queue in the order of corrected stamps [ns], and what its stamps tell of its clock."""
+    """One camera's queue in the order of corrected stamps [ns], and what its stamps show of its clock."""
 
     def __init__(self, offset: int, queue_size: int, clock_jump: int) -> None:
         self.offset = offset
@@ -411,9 +413,9 @@ def _check_cameras(cameras: Sequence[str], anchor: str, offsets: Mapping[str, fl
         raise ConfigError(f"offsets: {', '.join(unknown)} not among the cameras {', '.join(cameras)}")
 
 
-def _to_nanoseconds(field: str, seconds: float, minimum: float = -math.inf) -> int:
+def _checked_nanoseconds(field: str, seconds: float, minimum: float = -math.inf) -> int:
     number = isinstance(seconds, int | float) and not isinstance(seconds, bool)
     if not number or not math.isfinite(seconds) or seconds < minimum:
         bound = "" if math.isinf(minimum) else f" of at least {minimum}"
         raise ConfigError(f"{field}: expected a number of seconds{bound}, found {seconds!r}")
-    return round(seconds * NANOSECONDS)
+    return to_nanoseconds(seconds)

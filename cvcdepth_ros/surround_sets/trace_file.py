@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A trace of where the time goes, for https://ui.perfetto.dev or chrome://tracing. No ROS here.
+"""A trace of when each stage ran, for https://ui.perfetto.dev or chrome://tracing. No ROS here.
 
 Written as it happens in the array form of Chrome's trace event format, of which the end may be missing: a trace can be
 opened whatever ended the program. Its size is bounded; what comes later is left out.
@@ -21,7 +21,7 @@ class TraceFile:
     """Collects spans of time on the monotonic clock. Thread-safe; a full disk ends the trace, not the program."""
 
     def __init__(self, path: Path, limit_bytes: int = _LIMIT_BYTES) -> None:
-        """Begin the file anew. OutputError when it cannot be written."""
+        """Create the file, or truncate it. Raises OutputError when it cannot be written."""
         try:
             self._file = path.open("w", encoding="utf-8")
         except OSError as error:
@@ -42,7 +42,7 @@ class TraceFile:
             self._write(event | ({"args": arguments} if arguments else {}))
 
     def flush(self) -> None:
-        """Bring onto the disk what is there so far."""
+        """Write what is buffered to the disk."""
         with self._lock, suppress(OSError):
             self._file.flush()
 

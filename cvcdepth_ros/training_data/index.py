@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is in a recording for training: its surround sets and where the vehicle was at each exposure. No ROS here.
+"""Index of a recording for training: its surround sets and the vehicle's pose at each exposure. No ROS here.
 
 An index is built in one pass and kept beside the run; it is built anew when a file of the recording changes.
 """
@@ -19,14 +19,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cvcdepth_core.errors import CvcDepthError, ImageError, RecordingError, RigError, TransformError
+from cvcdepth_core.errors import ImageError, RecordingError, RigError, TransformError
 from cvcdepth_core.files import write_atomically
 from cvcdepth_core.rig.rig_file import RigLayout
-from cvcdepth_ros.bags import Location, RecordedMessage, Recording, file_identities, open_recording
+from cvcdepth_core.stamps import exposure_times
+from cvcdepth_ros.bags import Location, Recording, file_identities, open_recording
 from cvcdepth_ros.messages.conversion import picture_from_message
-from cvcdepth_ros.recordings.lidar import VehicleMotion
-from cvcdepth_ros.recordings.replay import RecordedImage, Refusals, SurroundReplay
-from cvcdepth_ros.recordings.rig import assemble_rig, discover_rig, topics_without_images
+from cvcdepth_ros.recordings.motion import VehicleMotion
+from cvcdepth_ros.recordings.refusals import Refusals
+from cvcdepth_ros.recordings.replay import RecordedImage, SurroundReplay
+from cvcdepth_ros.recordings.rig import RecordedRig, topics_without_images
+from cvcdepth_ros.recordings.truth import RecordedTruth
 from cvcdepth_ros.settings import MatchingSettings
 from cvcdepth_ros.surround_sets.synchronizer import SurroundSet
 
@@ -42,29 +45,28 @@ class RecordingIndex:
     layout: RigLayout
     """The rig, complete."""
     stamps: NDArray[np.int64]
-    """[S, N] each image's own stamp, ns: by which its message is told from others."""
+    """[S, N] each image's own stamp, ns: identifies its message."""
     log_times: NDArray[np.int64]
     """[S, N] when each image was recorded, ns: where it is found again."""
     poses: NDArray[np.float64] | None
-    """[S, N, 4, 4] world_T_base at each camera's exposure; None where the recording tells no motion."""
+    """[S, N, 4, 4] world_T_base at each camera's exposure; None where no motion is recorded."""
     thumbnails: NDArray[np.uint8] | None
-    """[S, h, w] small grey pictures of the anchor camera, to see motion by where none is recorded."""
-    unplaced: int = 0
-    """Sets left out since the recorded motion does not reach them."""
+    """[S, h, w] small grey pictures of the anchor camera, to measure change by where no motion is recorded."""
+    without_motion: int = 0
+    """Sets left out since they lie outside of the recorded motion."""
     unread: tuple[str, ...] = ()
-    """What of the recording could not be read or used, in words."""
+    """Descriptions of messages and sets that could not be read or used."""
 
     @property
     def times(self) -> NDArray[np.int64]:
         """[S, N] when each image was taken, ns: its stamp without its camera's offset."""
         offsets = np.array([camera.stamp_offset_ns for camera in self.layout.cameras], dtype=np.int64)
-        times: NDArray[np.int64] = self.stamps - offsets
-        return times
+        return exposure_times(self.stamps, offsets)
 
     @property
     def losses(self) -> list[str]:
-        """What of the recording is not there to learn from, in words."""
-        outside = [f"{self.unplaced} sets lie outside of the recorded motion"] if self.unplaced else []
+        """Descriptions of the parts of the recording that are missing from the index."""
+        outside = [f"{self.without_motion} sets lie outside of the recorded motion"] if self.without_motion else []
         return [*self.unread, *outside]
 
     def __len__(self) -> int:
@@ -81,7 +83,7 @@ def load_index(
 ) -> RecordingIndex:
     """Return the index of the recording at `path`, from `directory` when a current one is there, else built and kept.
 
-    `rig_layout` names cameras and what the recording does not tell; without it the cameras are found. Raises
+    `rig_layout` names cameras and what the recording lacks; without it the cameras are found. Raises
     RecordingError, RigError or TransformError, naming the recording, when it has no sets or no complete rig.
     """
     key = _key(path, matching, rig_layout)
@@ -95,16 +97,24 @@ def load_index(
 
 
 def build_index(path: Location, matching: MatchingSettings, rig_layout: RigLayout | None = None) -> RecordingIndex:
-    """Read the whole recording once; see `load_index`."""
+    """Return the index of the recording at `path`, read anew; see `load_index`."""
     with open_recording(path) as recording:
-        layout = _complete_layout(recording, rig_layout)
-        replay = SurroundReplay(recording, layout, matching)
-        motion = VehicleMotion.find(recording, layout.base_frame, replay.transforms)
-        refused = Refusals()
-        sets, thumbnails = _collect(recording, replay, motion, refused)
-        if not sets:
-            raise RecordingError(f"{path}: no surround set: {replay.why_no_set()}")
-        unread = tuple(_unread(recording, replay, refused, len(sets)))
+        if rig_layout is None:
+            _refuse_blind_cameras(recording)
+            return index_recording(RecordedRig.from_recording(recording), matching)
+        return index_recording(RecordedRig.from_recording(recording, rig_layout).completed(), matching)
+
+
+def index_recording(recorded: RecordedRig, matching: MatchingSettings) -> RecordingIndex:
+    """Return the index of a rig's recording, which is read through; see `load_index` for the errors."""
+    path, layout = recorded.recording.path, recorded.layout
+    _refuse_lonely_cameras(recorded)
+    replay = SurroundReplay(recorded, matching)
+    truth = RecordedTruth(recorded, lidar=())
+    motion = truth.motion
+    sets, thumbnails = _collect(replay, truth)
+    if not sets:
+        raise RecordingError(f"{path}: no surround set: {replay.why_no_set()}")
     poses = None if motion is None else [_poses(motion, surround_set) for surround_set in sets]
     placed = [i for i in range(len(sets)) if poses is None or poses[i] is not None]
     if not placed:
@@ -116,34 +126,28 @@ def build_index(path: Location, matching: MatchingSettings, rig_layout: RigLayou
         log_times=_table(sets, placed, lambda found: [found.images[name] for name in layout.names]),
         poses=None if poses is None else np.array([poses[i] for i in placed]).reshape(-1, len(layout.names), 4, 4),
         thumbnails=np.stack(thumbnails) if motion is None else None,
-        unplaced=len(sets) - len(placed),
-        unread=unread,
+        without_motion=len(sets) - len(placed),
+        unread=tuple(_unread(replay, truth.refused, len(sets))),
     )
 
 
-def _unread(recording: Recording, replay: SurroundReplay, refused: Refusals, sets: int) -> Iterator[str]:
-    """Say what of a recording that was read to its end, and gave so many sets, could not be read or used."""
-    if recording.damage:
-        yield f"not everything could be read: {recording.damage}"
+def _unread(replay: SurroundReplay, refused: Refusals, sets: int) -> Iterator[str]:
+    """Yield descriptions of what could not be read or used, after the replay's end and with so many sets left."""
+    if replay.recording.damage:
+        yield f"not everything could be read: {replay.recording.damage}"
     yield from (str(found) for found in (replay.unreadable, refused) if found.count)
     if undecodable := replay.statistics.sets - sets:
         yield f"{undecodable} sets are left out: no picture of camera {replay.layout.anchor_camera} could be decoded"
 
 
-def _complete_layout(recording: Recording, layout: RigLayout | None) -> RigLayout:
-    if layout is not None:
-        complete = assemble_rig(recording, layout).completed_layout()
-    else:
-        _refuse_blind_cameras(recording)
-        complete = discover_rig(recording)
-    neighbours = complete.complete().neighbours
+def _refuse_lonely_cameras(recorded: RecordedRig) -> None:
+    neighbours = recorded.layout.complete().neighbours
     lonely = [name for name, others in neighbours.items() if not others]
     if lonely:
         raise RigError(
-            f"{recording.path}: camera {', '.join(lonely)}: shares no view with another camera, so there is no overlap "
-            "to learn metric depth from; `bag_replay rig` shows the overlaps"
+            f"{recorded.recording.path}: camera {', '.join(lonely)}: shares no view with another camera, so there is "
+            "no overlap to learn metric depth from; `bag_replay rig` shows the overlaps"
         )
-    return complete
 
 
 def _refuse_blind_cameras(recording: Recording) -> None:
@@ -153,25 +157,11 @@ def _refuse_blind_cameras(recording: Recording) -> None:
         )
 
 
-def _collect(
-    recording: Recording, replay: SurroundReplay, motion: VehicleMotion | None, refused: Refusals
-) -> tuple[list[SurroundSet[int]], list[NDArray[np.uint8]]]:
-    """Return the sets with the images' log times, and thumbnails when there is no `motion` to fill meanwhile.
-
-    Messages that tell no motion are added to `refused`.
-    """
-
-    def add_motion(message: RecordedMessage) -> None:
-        try:
-            if motion is not None:
-                motion.add(recording.deserialize(message))
-        except CvcDepthError as error:
-            refused.add(str(error))
-
-    handlers = {} if motion is None else {motion.topic: add_motion}
+def _collect(replay: SurroundReplay, truth: RecordedTruth) -> tuple[list[SurroundSet[int]], list[NDArray[np.uint8]]]:
+    """Return the sets with the images' log times, and thumbnails when there is no motion for `truth` to read along."""
     sets, thumbnails = [], []
-    for found in replay.sets(handlers=handlers):
-        if motion is None:
+    for found in replay.sets(handlers=truth.handlers):
+        if truth.motion is None:
             thumbnail = _thumbnail(found, replay.layout.anchor_camera)
             if thumbnail is None:
                 continue
@@ -228,7 +218,7 @@ def _write(cached: Path, index: RecordingIndex, key: str) -> None:
         content,
         key=np.array(key),
         layout=np.array(index.layout.model_dump_json()),
-        unplaced=np.array(index.unplaced),
+        unplaced=np.array(index.without_motion),
         unread=np.array(json.dumps(index.unread)),
         **{name: array for name, array in arrays.items() if array is not None},
     )

@@ -15,7 +15,8 @@ from cvcdepth_core.rig.rig_file import RigLayout
 from cvcdepth_core.rig_health.own_body import MIN_TRAVEL, SelfOcclusionFinder
 from cvcdepth_core.training.config import RecordingsConfig
 from cvcdepth_ros.training_data.index import RecordingIndex
-from cvcdepth_ros.training_data.samples import SampleReader, change_between
+from cvcdepth_ros.training_data.sample_choice import change_between
+from cvcdepth_ros.training_data.samples import SampleReader
 
 _MAX_PAIRS = 60
 _MIN_IMAGE_CHANGE = 4.0  # grey levels of the small pictures, where no motion is recorded: half a metre in a street
@@ -35,7 +36,7 @@ def find_self_occlusion(index: RecordingIndex) -> dict[str, NDArray[np.uint8]]:
     for earlier, later in _pairs(index):
         try:
             finder.add(list(reader.pictures(0, earlier)), list(reader.pictures(0, later)))
-        except ImageError:  # one damaged picture says nothing about the vehicle
+        except ImageError:  # one damaged picture shows nothing of the vehicle
             continue
     scene = finder.scene()
     return {

@@ -24,6 +24,7 @@ from repository import ROOT
 from rosbags.highlevel import AnyReader
 from s3_server import LocalS3
 
+from cvcdepth_core.errors import RecordingError
 from cvcdepth_core.networks import DepthNet
 from cvcdepth_core.networks.checkpoint import save_checkpoint
 from cvcdepth_core.networks.registry import DepthModelSpec
@@ -32,7 +33,7 @@ from cvcdepth_ros.bag_replay import main
 from cvcdepth_ros.commands import arguments
 from cvcdepth_ros.evaluation.image_scores import LabelFree, SetScore
 from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings
-from cvcdepth_ros.evaluation.measuring import RecordingScores, open_evaluation
+from cvcdepth_ros.evaluation.measuring import RecordingScores, Remeasuring, open_evaluation
 from cvcdepth_ros.evaluation.result import Failure
 from cvcdepth_ros.evaluation.workers import evaluate_all
 from cvcdepth_ros.recordings.replay import DepthReplay
@@ -80,7 +81,7 @@ def two_sets(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_run_and_evaluate_give_the_same_depth_bit_for_bit(two_sets: Path, tmp_path: Path):
     job = EvaluationJob("two_sets", str(two_sets), EvaluationSettings(untrained=True, height=64, width=96))
     with open_evaluation(job) as evaluation:
-        scored = [measured.estimated.depth.depth for measured in evaluation.sets(*evaluation.window)]
+        scored = [measured.estimated.result.depth for measured in evaluation.sets(*evaluation.window)]
     assert len(scored) == 2
     assert main(["run", str(two_sets), "-o", str(tmp_path / "depth"), *SMALL]) == 0
     for index, name in enumerate(CAMERAS):
@@ -215,6 +216,19 @@ def test_the_lidars_own_depth_as_prediction_has_no_error():
     for samples in again.samples():
         assert len(samples.truth) > 1000
         np.testing.assert_allclose(samples.prediction, samples.truth, rtol=1e-6)
+
+
+def test_a_set_that_is_measured_again_is_the_same_whatever_was_measured_before_it():
+    job = EvaluationJob("sample", str(SAMPLE), EvaluationSettings(untrained=True, height=64, width=96), duration=0.35)
+    with open_evaluation(job) as evaluation:
+        expected = list(evaluation.sets(*evaluation.window))
+    with Remeasuring() as again:
+        for measured in (expected[-1], expected[0], expected[0]):
+            found = again.measured_set(job, measured.stamp_ns, measured.log_time)
+            np.testing.assert_array_equal(found.estimated.result.depth, measured.estimated.result.depth)
+            np.testing.assert_array_equal(found.lidar, measured.lidar)
+        with pytest.raises(RecordingError, match=r"excerpt: no set at 7 ns"):
+            again.measured_set(job, 7, measured.log_time)
 
 
 def test_a_part_of_a_recording_scores_as_it_does_within_the_whole(output: Path, tmp_path: Path):

@@ -23,10 +23,11 @@ from cvcdepth_core.surround_depth import SurroundPictures
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.live.camera_states import CameraState, CameraWatch
 from cvcdepth_ros.live.mailbox import Mailbox
-from cvcdepth_ros.live.pipeline import PublishedSet, SurroundPipeline
+from cvcdepth_ros.live.picture_preparation import CameraImage
+from cvcdepth_ros.live.pipeline import SurroundPipeline
 from cvcdepth_ros.recordings.rig import discover_rig
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
-from cvcdepth_ros.surround_sets.set_estimation import estimate_set, picture_or_error
+from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet, estimate_set, picture_or_error
 from cvcdepth_ros.surround_sets.synchronizer import SurroundSynchronizer
 
 TIMEOUT = 60.0
@@ -84,14 +85,14 @@ class Running:
     """A pipeline and what came out of it."""
 
     def __init__(self, layout: Any, predictor: Any, min_cameras: int = 0) -> None:
-        self.published: list[PublishedSet] = []
+        self.published: list[EstimatedSet[CameraImage]] = []
         self.wanted = set(layout.names)
         self.watches = {name: CameraWatch(1000.0, 1.0) for name in layout.names}
         self.latencies = StageLatencies()
         self.mailbox: Mailbox[Any] = Mailbox()
         self.pipeline = SurroundPipeline(
             predictor,
-            SurroundSynchronizer.of_rig(layout, 0.1, min_cameras=min_cameras),
+            SurroundSynchronizer.from_layout(layout, 0.1, min_cameras=min_cameras),
             self.mailbox,
             self.watches,
             lambda camera: camera in self.wanted,
@@ -131,11 +132,11 @@ def test_what_comes_out_is_what_the_bag_tool_computes_to_the_bit(start, estimato
     running.wait(lambda: running.published)
     first = running.published[0]
     by_stamp = {(c, m.header.stamp.sec * 10**9 + m.header.stamp.nanosec): m for c, m in images}
-    messages = {camera: by_stamp[camera, stamp] for camera, stamp in first.images.stamps_ns.items()}
+    messages = {camera: by_stamp[camera, stamp] for camera, stamp in first.surround_set.stamps_ns.items()}
     surround = SurroundDepthEstimator(layout.complete(), estimator)
     expected = estimate_set(messages, surround, StageLatencies(), required=6)
-    np.testing.assert_array_equal(first.depth.depth, expected.depth)
-    np.testing.assert_array_equal(first.depth.pictures, expected.pictures)
+    np.testing.assert_array_equal(first.result.depth, expected.depth)
+    np.testing.assert_array_equal(first.result.pictures, expected.pictures)
 
 
 def test_a_network_that_looks_at_all_cameras_gives_one_subscriber_what_it_gives_to_all(
@@ -180,7 +181,7 @@ def test_while_the_network_is_busy_only_the_newest_set_waits(start, estimator, i
     slowed.gate.set()
     running.wait(lambda: len(running.published) == 2)
     last = max(m.header.stamp.nanosec + 10**9 * m.header.stamp.sec for c, m in images[-12:-6] if c == "front")
-    assert running.published[-1].images.stamp_ns >= last
+    assert running.published[-1].surround_set.stamp_ns >= last
     assert running.pipeline.counters["published"] == 2
 
 
@@ -203,7 +204,7 @@ def test_only_wanted_cameras_are_decoded_and_estimated(start, estimator, images)
     running.feed(images[:12])
     running.wait(lambda: running.published)
     assert slowed.cameras[0] == 2
-    present = dict(zip(running.published[0].rig.names, running.published[0].depth.present.tolist(), strict=True))
+    present = dict(zip(running.published[0].rig.names, running.published[0].result.present.tolist(), strict=True))
     assert present == {name: name in ("left", "back") for name in CAMERAS}
     assert running.latencies.summaries()["decode"].count <= 4
 
@@ -241,18 +242,18 @@ def test_with_min_cameras_a_damaged_image_costs_its_own_camera_only(start, estim
     running = start(estimator, min_cameras=4)
     running.feed(damage(images[:12], "left"))
     running.wait(lambda: running.published)
-    depth = running.published[0].depth
-    assert depth.present.tolist() == [name != "left" for name in running.published[0].rig.names]
-    assert np.isnan(depth.depth[~depth.present]).all()
+    result = running.published[0].result
+    assert result.present.tolist() == [name != "left" for name in running.published[0].rig.names]
+    assert np.isnan(result.depth[~result.present]).all()
 
 
 def test_a_silent_camera_is_left_out_and_returns(start, estimator, images):
     running = start(estimator, min_cameras=5)
     running.feed([(c, m) for c, m in images[:48] if c != "back"])
     running.wait(lambda: running.published)
-    assert "back" not in running.published[-1].images.images
+    assert "back" not in running.published[-1].surround_set.images
     running.feed(images[48:])
-    running.wait(lambda: "back" in running.published[-1].images.images)
+    running.wait(lambda: "back" in running.published[-1].surround_set.images)
 
 
 def test_a_camera_without_calibration_is_left_out_until_it_has_one(start, estimator, layout, images):
@@ -280,7 +281,7 @@ def test_a_failing_publisher_does_not_end_the_stream(start, estimator, images):
     running = start(estimator)
     failures = iter([True])
 
-    def publish(one: PublishedSet) -> None:
+    def publish(one: EstimatedSet[CameraImage]) -> None:
         if next(failures, False):
             raise RuntimeError("no such luck")
         running.published.append(one)

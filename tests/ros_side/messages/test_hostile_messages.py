@@ -13,8 +13,8 @@ from cvcdepth_core.errors import CvcDepthError, ImageError, RecordingError, RigE
 from cvcdepth_core.images.rectifier import Rectifier
 from cvcdepth_ros.bags import typestore
 from cvcdepth_ros.messages.conversion import calibration_from_message, picture_from_message, stamp_ns
+from cvcdepth_ros.messages.point_clouds import points_from_message
 from cvcdepth_ros.messages.transforms import PoseTrack, TransformTree
-from cvcdepth_ros.recordings.lidar import points_from_message
 
 TYPES = typestore().types
 UINT32 = st.one_of(st.integers(0, 64), st.integers(0, 2**32 - 1))

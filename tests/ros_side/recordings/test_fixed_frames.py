@@ -14,7 +14,7 @@ from cvcdepth_core.errors import TransformError
 from cvcdepth_core.rig.rig_file import RigLayout
 from cvcdepth_ros.bag_replay import main
 from cvcdepth_ros.bags import open_recording
-from cvcdepth_ros.recordings.rig import assemble_rig, discover_rig
+from cvcdepth_ros.recordings.rig import RecordedRig, discover_rig
 
 Change = Callable[[int, Any], None]
 
@@ -61,14 +61,14 @@ def test_cameras_and_lidar_on_tf_are_found_where_they_do_not_move(tmp_path: Path
     path = on_tf(tmp_path / "bag")
     assert rig_of(path) == rig_of(SAMPLE)
     with open_recording(path) as moved, open_recording(SAMPLE) as sample:
-        trees = [assemble_rig(recording, rig_of(SAMPLE)).transforms for recording in (moved, sample)]
+        trees = [RecordedRig.from_recording(recording, rig_of(SAMPLE)).transforms for recording in (moved, sample)]
     lidar = [tree.lookup("base_link", "pandar64") for tree in trees]
     np.testing.assert_array_equal(*lidar)
 
 
 def test_the_vehicles_own_motion_is_no_fixed_frame(tmp_path: Path):
     with open_recording(on_tf(tmp_path / "bag")) as recording:
-        tree = assemble_rig(recording, discover_rig(recording)).transforms
+        tree = RecordedRig.from_recording(recording).transforms
     assert "odom" not in tree.frames
 
 

@@ -24,14 +24,9 @@ from cvcdepth_ros.messages.conversion import picture_from_message, stamp_ns
 from cvcdepth_ros.recordings.rig import discover_rig
 from cvcdepth_ros.settings import MatchingSettings
 from cvcdepth_ros.training_data.index import build_index, load_index
-from cvcdepth_ros.training_data.samples import (
-    RecordingBatches,
-    SampleReader,
-    _collate,
-    find_samples,
-    refuse_standstill,
-    told_beyond_reach,
-)
+from cvcdepth_ros.training_data.loader import RecordingBatches, _collate
+from cvcdepth_ros.training_data.sample_choice import describe_skipped_samples, find_samples, refuse_standstill
+from cvcdepth_ros.training_data.samples import SampleReader
 
 MATCHING = MatchingSettings()
 EVERYTHING = RecordingsConfig(held_out=0.0)
@@ -104,9 +99,9 @@ def test_samples_between_whose_sets_the_vehicle_moves_too_far_are_left_out_and_t
     jumping = replace(index, poses=poses)
     samples = find_samples(jumping, EVERYTHING, "training")
     assert [sample.target for sample in samples] == [1, 2, 3, 4, 7, 8]
-    told = told_beyond_reach(jumping, EVERYTHING)
+    told = describe_skipped_samples(jumping, EVERYTHING)
     assert re.match(r"2 training samples are left out: the vehicle moves up to 5\.\d m between two", told)
-    assert told_beyond_reach(index, EVERYTHING) is None
+    assert describe_skipped_samples(index, EVERYTHING) is None
     fast = replace(index, poses=np.where(np.arange(4) == 3, 20 * index.poses, index.poses))
     with pytest.raises(RecordingError, match=r"no training sample in 10 sets: 8 training samples are left out"):
         RecordingBatches([fast], config())
@@ -344,7 +339,7 @@ def test_an_impossible_pose_costs_itself_only_and_is_told(spoil, topic, other, i
     for number, placed in ((0, 9), (13, 10)):
         entries = spoiled(without(sample_entries(), other), topic, number, spoil)
         recording = load_index(write_rosbag2(tmp_path / f"{number}", entries), tmp_path / "index", MATCHING)
-        assert (len(recording), recording.unplaced) == (placed, 10 - placed)
+        assert (len(recording), recording.without_motion) == (placed, 10 - placed)
         np.testing.assert_allclose(recording.poses, index.poses[-placed:], atol=0.02)
         (told,) = recording.unread
         assert told.startswith("1 refused, the first: ")
@@ -389,9 +384,9 @@ def test_sets_that_the_recorded_motion_does_not_reach_are_left_out(tmp_path):
     last = max(entry.log_time for entry in entries)
     short = [e for e in entries if e.topic not in ("/tf", "/odom") or last - e.log_time > 3 * ONE_STEP_NS]
     recording = build_index(write_rosbag2(tmp_path / "short", short), MATCHING)
-    assert len(recording) + recording.unplaced == 10
-    assert recording.unplaced >= 3
-    assert recording.losses == [f"{recording.unplaced} sets lie outside of the recorded motion"]
+    assert len(recording) + recording.without_motion == 10
+    assert recording.without_motion >= 3
+    assert recording.losses == [f"{recording.without_motion} sets lie outside of the recorded motion"]
 
 
 def test_an_index_tells_what_of_the_recording_was_not_there_to_learn_from(index, tmp_path):

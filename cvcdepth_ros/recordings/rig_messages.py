@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The messages of a recording that describe its sensors: CameraInfo, fixed transforms, frames of point clouds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from copy import deepcopy
+from functools import cached_property
+from typing import Any, NamedTuple
+
+from cvcdepth_core.errors import RecordingError, TransformError
+from cvcdepth_core.rig.rig_file import RigLayout
+from cvcdepth_ros.bags import RecordedMessage, Recording
+from cvcdepth_ros.messages.camera_discovery import CAMERA_INFO_TYPE
+from cvcdepth_ros.messages.point_clouds import POINT_CLOUD_TYPE, has_colours
+from cvcdepth_ros.messages.rig_assembly import RigAssembler
+from cvcdepth_ros.messages.transforms import TransformTree, frame_name
+from cvcdepth_ros.recordings.fixed_frames import (
+    MOVING_TRANSFORMS,
+    ObservedLink,
+    add_fixed_frames,
+    has_transforms,
+    observed_links,
+)
+
+STATIC_TRANSFORMS = "/tf_static"
+
+
+class CloudSource(NamedTuple):
+    """The source of one topic's clouds, by its first message that can be read."""
+
+    frame_id: str
+    has_colours: bool
+    """Whether they were made from camera images: a LiDAR's points have no colours."""
+
+
+class RigMessages:
+    """The first CameraInfo of each camera, all fixed transforms, and the sources of all point clouds of a recording.
+
+    They are read in one pass, which drops each topic as soon as nothing more of it is needed, so that blocks of the
+    file that hold nothing else are skipped.
+    """
+
+    def __init__(self, recording: Recording, layout: RigLayout | None) -> None:
+        """Read for the cameras of `layout`; for none of them where it is None.
+
+        Damaged messages raise nothing here, see `assembler`.
+        """
+        self._recording = recording
+        self.static_links: dict[str, Any] = {}
+        """The last `geometry_msgs/TransformStamped` of `/tf_static` for each child frame."""
+        self._camera_infos: dict[str, Any] = {}
+        """By topic; RecordingError in place of a message that cannot be read."""
+        self._clouds: dict[str, CloudSource] = {}
+        self._transforms = TransformTree()
+        self._contradiction: TransformError | RecordingError | None = None
+        self._awaited = {*_camera_info_topics(recording, layout), *cloud_topics(recording)}
+        if has_transforms(recording, STATIC_TRANSFORMS):
+            self._awaited.add(STATIC_TRANSFORMS)
+        self._read()
+
+    @property
+    def lidars(self) -> tuple[str, ...]:
+        """The topics of the LiDARs, sorted: those of all point clouds that were not made from camera images."""
+        return tuple(topic for topic in cloud_topics(self._recording) if topic not in self.camera_clouds)
+
+    @property
+    def camera_clouds(self) -> tuple[str, ...]:
+        """The topics with clouds that were made from camera images, sorted.
+
+        The node's own clouds are among them where it ran during the recording: they are no ground truth.
+        """
+        return tuple(sorted(topic for topic, source in self._clouds.items() if source.has_colours))
+
+    def assembler(self, layout: RigLayout) -> RigAssembler:
+        """Return an assembler of `layout` with everything that was read for it; the rig may still be incomplete.
+
+        Transforms are those of `/tf_static`; frames of cameras and LiDARs that are not connected there are looked for
+        on `/tf`, see `add_fixed_frames`. Raises RecordingError for a CameraInfo that cannot be read, and TransformError
+        for transforms that contradict each other, and for a camera that moves.
+        """
+        assembler = RigAssembler(layout, deepcopy(self._transforms))
+        for topic, info in self._camera_infos.items():
+            if isinstance(info, RecordingError):
+                raise info
+            add_camera_info(assembler, topic, info)
+        if self._contradiction is not None:
+            raise self._contradiction
+        if has_transforms(self._recording, MOVING_TRANSFORMS):
+            self._add_fixed_frames(assembler)
+        return assembler
+
+    @cached_property
+    def _links(self) -> dict[str, ObservedLink]:
+        return observed_links(self._recording)
+
+    def _read(self) -> None:
+        position: int | None = 0
+        while position is not None and self._awaited:
+            position = self._read_from(position)
+
+    def _read_from(self, start: int) -> int | None:
+        """Take what is awaited up to the first message that is not any more; return its log time, None at the end."""
+        for message in self._recording.messages(set(self._awaited), start):
+            if message.topic not in self._awaited:
+                return message.log_time
+            self._take(message)
+        return None
+
+    def _take(self, message: RecordedMessage) -> None:
+        if message.topic == STATIC_TRANSFORMS:
+            self._add_transforms(message)
+        elif self._recording.topics[message.topic].type == CAMERA_INFO_TYPE:
+            self._awaited.remove(message.topic)
+            self._camera_infos[message.topic] = self._content_or_error(message)
+        else:
+            self._add_cloud(message)
+
+    def _add_transforms(self, message: RecordedMessage) -> None:
+        try:
+            content = self._recording.deserialize(message)
+            self._transforms.add_message(content)
+            self.static_links |= {frame_name(link.child_frame_id): link for link in content.transforms}
+        except TransformError as error:
+            self._contradiction = TransformError(f"{self._recording.path}: {STATIC_TRANSFORMS}: {error}")
+        except RecordingError as error:
+            self._contradiction = error
+        if self._contradiction is not None:
+            self._awaited.remove(STATIC_TRANSFORMS)
+
+    def _add_cloud(self, message: RecordedMessage) -> None:
+        with suppress(RecordingError):
+            content = self._recording.deserialize(message)
+            self._clouds[message.topic] = CloudSource(content.header.frame_id, has_colours(content))
+            self._awaited.remove(message.topic)
+
+    def _content_or_error(self, message: RecordedMessage) -> Any:
+        try:
+            return self._recording.deserialize(message)
+        except RecordingError as error:
+            return error
+
+    def _add_fixed_frames(self, assembler: RigAssembler) -> None:
+        tree, base_frame = assembler.transforms, assembler.layout.base_frame
+        open_cameras = [camera.name for camera in assembler.layout.cameras if camera.base_T_camera is None]
+        cameras = _unconnected(tree, base_frame, [assembler.frame_id(name) or "" for name in open_cameras])
+        lidars = _unconnected(tree, base_frame, [self._clouds[topic].frame_id for topic in sorted(self._clouds)])
+        if not cameras and not lidars:
+            return
+        try:
+            assembler.frames_on_tf += add_fixed_frames(tree, self._links, base_frame, cameras)
+        except TransformError as error:
+            raise TransformError(f"{self._recording.path}: {error}") from error
+        for lidar in lidars:
+            try:
+                assembler.frames_on_tf += add_fixed_frames(tree, self._links, base_frame, [lidar])
+            except TransformError as error:  # without it there is less truth, no less depth
+                tree.refused[frame_name(lidar)] = str(error)
+
+
+def cloud_topics(recording: Recording) -> list[str]:
+    """Return the names of all topics with point clouds, sorted."""
+    return sorted(topic.name for topic in recording.topics.values() if topic.type == POINT_CLOUD_TYPE and topic.count)
+
+
+def describe_camera_clouds(topics: Sequence[str]) -> str:
+    """Return why these topics, `RigMessages.camera_clouds`, are no LiDAR's."""
+    return f"not taken for a LiDAR's, since their points have colours: {', '.join(topics)}"
+
+
+def add_camera_info(assembler: RigAssembler, topic: str, message: Any) -> bool:
+    """Add a CameraInfo to every camera of that topic; return whether it changes anything."""
+    cameras = [camera.name for camera in assembler.layout.cameras if camera.camera_info_topic == topic]
+    return True in [assembler.add_camera_info(camera, message) for camera in cameras]
+
+
+def _camera_info_topics(recording: Recording, layout: RigLayout | None) -> set[str]:
+    recorded = {topic.name for topic in recording.topics.values() if topic.type == CAMERA_INFO_TYPE}
+    return {camera.camera_info_topic for camera in (layout.cameras if layout else ())} & recorded
+
+
+def _unconnected(tree: TransformTree, base_frame: str, frames: Sequence[str]) -> list[str]:
+    root = tree.ancestors(base_frame)[-1]
+    return [frame for frame in frames if tree.ancestors(frame)[-1] != root]

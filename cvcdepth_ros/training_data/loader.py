@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Batches of training samples, shuffled anew every epoch and shared among processes. No ROS here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import partial
+from itertools import cycle, islice
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from torch.utils.data import DataLoader
+
+from cvcdepth_core.errors import RecordingError
+from cvcdepth_core.training.batch import RigBatch
+from cvcdepth_core.training.config import RecordingsConfig, TrainingConfig
+from cvcdepth_core.training.distributed import SINGLE_PROCESS, Processes
+from cvcdepth_ros.training_data.index import RecordingIndex
+from cvcdepth_ros.training_data.sample_choice import Sample, find_samples, refuse_standstill
+from cvcdepth_ros.training_data.samples import NetworkRig, ReadSample, SampleReader
+
+
+class _EpochOrder:
+    """The batches that a DataLoader asks for; another list for every epoch, so that its workers live on."""
+
+    def __init__(self) -> None:
+        self.batches: list[list[int]] = []
+
+    def __iter__(self) -> Iterator[list[int]]:
+        return iter(self.batches)
+
+    def __len__(self) -> int:
+        return len(self.batches)
+
+
+class RecordingBatches:
+    """The part of the training samples that is this process's, shuffled anew every epoch; each batch is of one rig.
+
+    The order depends on seed and epoch only, so that a run can be resumed at any batch. Samples that go through the
+    networks of several processes together are of one rig, too.
+    """
+
+    def __init__(
+        self, indexes: Sequence[RecordingIndex], config: TrainingConfig, processes: Processes = SINGLE_PROCESS
+    ) -> None:
+        """Find the samples; RecordingError names recording and values when there are none."""
+        _refuse_unrecorded_motion(indexes, config.recordings)
+        refuse_standstill(indexes, config.recordings)
+        samples = [
+            sample
+            for recording, index in enumerate(indexes)
+            for sample in find_samples(index, config.recordings, "training", recording)
+        ]
+        self.reader = SampleReader(indexes, samples, config.depth.height, config.depth.width, config.recordings)
+        self._rig_groups = _group_by_rig(indexes, samples)
+        self._processes = processes
+        self._samples_together = config.optimizer.samples_per_batch * processes.count
+        self._seed = config.seed
+        self._order = _EpochOrder()
+        self._loader = _loader(self.reader, self._order, config.recordings.workers)
+
+    def __len__(self) -> int:
+        return len(self._shuffled(epoch=0))
+
+    @property
+    def samples(self) -> int:
+        """Samples of one epoch, of all processes together."""
+        return len(self.reader)
+
+    def epoch(self, number: int, first: int = 0) -> Iterator[RigBatch | None]:
+        """Yield the batches of an epoch from the `first` on; None for one whose images are all damaged."""
+        rank, count = self._processes.rank, self._processes.count
+        self._order.batches = [_at_least(together, count)[rank::count] for together in self._shuffled(number)[first:]]
+        yield from self._loader
+
+    def _shuffled(self, epoch: int) -> list[list[int]]:
+        """Return the samples that go together through the networks of all processes."""
+        generator = np.random.default_rng([self._seed, epoch])
+        size = self._samples_together
+        orders = [generator.permutation(group).tolist() for group in self._rig_groups]
+        batches = [order[start : start + size] for order in orders for start in range(0, len(order), size)]
+        return [batches[i] for i in generator.permutation(len(batches))]
+
+
+def _refuse_unrecorded_motion(indexes: Sequence[RecordingIndex], config: RecordingsConfig) -> None:
+    without = [str(index.path) for index in indexes if index.poses is None]
+    if config.exposure_motion == "recorded" and without:
+        raise RecordingError(
+            f"{', '.join(without)}: no motion is recorded, but recordings.exposure_motion is 'recorded'; 'auto' takes "
+            "the pose network's there"
+        )
+
+
+def _at_least(samples: list[int], count: int) -> list[int]:
+    """Repeat samples, at the end of a rig's, until every process has one: they wait for each other."""
+    return list(islice(cycle(samples), max(count, len(samples))))
+
+
+def _group_by_rig(indexes: Sequence[RecordingIndex], samples: Sequence[Sample]) -> list[list[int]]:
+    """Return the samples' positions, those of equal rigs together."""
+    layouts = [index.layout for index in indexes]
+    groups: dict[int, list[int]] = {}
+    for position, sample in enumerate(samples):
+        groups.setdefault(layouts.index(layouts[sample.recording]), []).append(position)
+    return list(groups.values())
+
+
+def _loader(reader: SampleReader, order: _EpochOrder, workers: int) -> DataLoader[Any]:
+    return DataLoader(
+        reader,
+        batch_sampler=order,
+        num_workers=workers,
+        persistent_workers=workers > 0,
+        # A forked worker inherits locks that a thread of OpenCV, torch or fsspec may hold, and then waits for ever.
+        multiprocessing_context="spawn" if workers else None,
+        collate_fn=partial(_collate, reader.rigs),
+        worker_init_fn=_one_thread,
+    )
+
+
+def _one_thread(_: int) -> None:
+    """Leave the cores to the other workers."""
+    cv2.setNumThreads(1)
+    torch.set_num_threads(1)
+
+
+def _collate(rigs: Sequence[NetworkRig], items: Sequence[ReadSample | None]) -> RigBatch | None:
+    read = [item for item in items if item is not None]
+    if not read:
+        return None
+    recordings, *columns = zip(*read, strict=True)
+    rig: NetworkRig = rigs[recordings[0]]
+    return rig.batch(*(torch.from_numpy(np.stack(column)) for column in columns))
