@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 from cvcdepth_core.errors import CvcDepthError, NotPromotedError
 from cvcdepth_ros.commands import bench, check, evaluate, export, finetune, inspect, play, rig, run
-from cvcdepth_ros.version import package_version
+from cvcdepth_ros.installation import package_version
 
 
 class Command(Protocol):

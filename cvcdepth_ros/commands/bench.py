@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from cvcdepth_core.errors import RecordingError
 from cvcdepth_ros.commands.arguments import add_recording, add_settings, positive, settings_from
+from cvcdepth_ros.installation import package_version
 from cvcdepth_ros.settings import ModelSettings
-from cvcdepth_ros.version import package_version
 
 if TYPE_CHECKING:
     from cvcdepth_core.rig.rig import RigLayout

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from cvcdepth_core.errors import ConfigError
 from cvcdepth_ros.commands.arguments import add_json, print_result, refuse_to_overwrite
-from cvcdepth_ros.version import package_version
+from cvcdepth_ros.installation import package_version
 
 if TYPE_CHECKING:
     from cvcdepth_core.networks.checkpoint import Checkpoint

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from cvcdepth_core.errors import ConfigError
 from cvcdepth_ros.commands.arguments import add_json, add_recording, print_result, refuse_to_overwrite, table
-from cvcdepth_ros.version import package_version
+from cvcdepth_ros.installation import package_version
 
 if TYPE_CHECKING:
     from cvcdepth_core.rig.rig import Camera, Rig, RigLayout

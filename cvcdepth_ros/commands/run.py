@@ -25,8 +25,8 @@ from cvcdepth_ros.commands.arguments import (
     warn,
     window_ns,
 )
+from cvcdepth_ros.installation import package_version
 from cvcdepth_ros.settings import MatchingSettings, MissingCameraSettings, ModelSettings, OutputSettings
-from cvcdepth_ros.version import package_version
 
 if TYPE_CHECKING:
     from cvcdepth_core.rig.rig import RigLayout

@@ -29,8 +29,8 @@ from cvcdepth_ros.end_to_end.live_run import LiveOutcome, LiveRun
 from cvcdepth_ros.end_to_end.paths import DemoPaths
 from cvcdepth_ros.end_to_end.processes import children
 from cvcdepth_ros.end_to_end.received import Output, ReceivedSets, node_outputs, sent_sets
+from cvcdepth_ros.installation import package_version
 from cvcdepth_ros.settings import ModelSettings
-from cvcdepth_ros.version import package_version
 
 SAMPLE = Path(__file__).parents[2] / "samples" / "pandaset_002_excerpt"
 NODE = "/surround_depth"

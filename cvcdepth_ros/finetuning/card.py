@@ -21,9 +21,9 @@ from cvcdepth_ros.bags import file_identities
 from cvcdepth_ros.evaluation.result import EvaluationResult
 from cvcdepth_ros.finetuning.judgement import camera_numbers, known, numbers_of
 from cvcdepth_ros.finetuning.run import FineTuned
+from cvcdepth_ros.installation import package_version
 from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS
 from cvcdepth_ros.training_data.index import RecordingIndex
-from cvcdepth_ros.version import package_version
 
 CARD_FILE, CARD_TEXT_FILE = "model_card.json", "model_card.md"
 

@@ -17,10 +17,10 @@ from cvcdepth_core.files import write_atomically
 from cvcdepth_core.rig.rig import RigLayout
 from cvcdepth_ros.bags import Location, file_identities, open_recording
 from cvcdepth_ros.checks import CheckContext, CheckOptions, CheckResult, NumberedResult, run_checks
+from cvcdepth_ros.installation import package_version
 from cvcdepth_ros.settings import MatchingSettings
 from cvcdepth_ros.training_data.index import RecordingIndex, load_index
 from cvcdepth_ros.training_data.own_body_masks import find_self_occlusion, save_masks
-from cvcdepth_ros.version import package_version
 
 NOT_NEEDED: Collection[str] = ("stamps", "LiDAR")
 """Checks whose failure does not spoil a training: the check of sets tells what odd stamps cost."""

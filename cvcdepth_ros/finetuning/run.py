@@ -24,8 +24,8 @@ from cvcdepth_ros.finetuning.preparation import Prepared, Source, prepare
 from cvcdepth_ros.finetuning.provenance import inputs_of
 from cvcdepth_ros.finetuning.tensorboard import TensorBoardObserver, has_tensorboard
 from cvcdepth_ros.finetuning.validation import CANDIDATE_FILE, HeldOutValidation
+from cvcdepth_ros.installation import package_version
 from cvcdepth_ros.training_data.samples import RecordingBatches, told_beyond_reach
-from cvcdepth_ros.version import package_version
 
 START_FILE, BEST_FILE = "start.safetensors", "best.safetensors"
 
