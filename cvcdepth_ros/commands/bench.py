@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cvcdepth_core.errors import RecordingError
-from cvcdepth_ros.commands.arguments import add_recording, add_settings, positive, settings_from
+from cvcdepth_ros.commands.arguments import add_recording, add_settings, settings_from
+from cvcdepth_ros.console import positive
 from cvcdepth_ros.installation import package_version
 from cvcdepth_ros.settings import ModelSettings
 

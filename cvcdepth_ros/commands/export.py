@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from cvcdepth_core.errors import ConfigError
-from cvcdepth_ros.commands.arguments import add_json, print_result, refuse_to_overwrite
+from cvcdepth_ros.commands.arguments import add_json, refuse_to_overwrite
+from cvcdepth_ros.console import print_result
 from cvcdepth_ros.installation import package_version
 
 if TYPE_CHECKING:

@@ -13,13 +13,11 @@ from cvcdepth_ros.commands.arguments import (
     add_quiet,
     add_recordings,
     add_skip,
-    can_draw,
     lidar_topics,
-    print_result,
     refuse_unknown_checks,
-    table,
-    warn,
 )
+from cvcdepth_ros.console import print_result, table, warn
+from cvcdepth_ros.reports import REPORT_FILE, can_draw_report
 
 if TYPE_CHECKING:
     from cvcdepth_core.training.distributed import Processes
@@ -37,7 +35,7 @@ EXAMPLES: tuple[str, ...] = (
     "finetune monday.mcap tuesday.mcap --config shuttle.yaml --from-scratch --rig shuttle_rig.yaml -o run",
 )
 
-_RESULT_FILE, _REPORT_FILE = "finetune.json", "report.html"
+_RESULT_FILE = "finetune.json"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -68,7 +66,7 @@ def execute(arguments: argparse.Namespace) -> None:
 
     refuse_unknown_checks(arguments)
     with launched_processes() as processes:
-        with_report = processes.is_first and can_draw(_REPORT_FILE)
+        with_report = processes.is_first and can_draw_report()
         tuned = _fine_tuned(arguments, processes)
     if tuned is None:
         return
@@ -126,7 +124,7 @@ def _written(tuned: "FineTuned", with_report: bool) -> dict[str, Any]:
     if with_report:
         from cvcdepth_ros.reports.finetuning_page import write_report
 
-        write_report(run / _REPORT_FILE, tuned, card)
+        write_report(run / REPORT_FILE, tuned, card)
     shown = ("started_from", "version", "promoted", "verdict", "scores", "left_out", "warnings", "configuration")
     result = {
         "checkpoint": str(tuned.weights),

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cvcdepth_core.errors import ConfigError
-from cvcdepth_ros.commands.arguments import add_json, add_recording, print_result, refuse_to_overwrite, table
+from cvcdepth_ros.commands.arguments import add_json, add_recording, refuse_to_overwrite
+from cvcdepth_ros.console import print_result, table
 from cvcdepth_ros.installation import package_version
 
 if TYPE_CHECKING:

@@ -14,13 +14,12 @@ from typing import Any
 
 import yaml
 from pydantic import ValidationError
-from tqdm import tqdm
 
 from cvcdepth_core.errors import ConfigError, CvcDepthError
 from cvcdepth_core.rig.calibration import first_validation_message
 from cvcdepth_core.rig.rig import RigLayout, load_rig_layout
 from cvcdepth_ros.bags import open_recording
-from cvcdepth_ros.commands.arguments import positive
+from cvcdepth_ros.console import positive, progress_bar
 from cvcdepth_ros.demo.pace import manageable_rate
 from cvcdepth_ros.demo.recorded_lidar import RecordedLidar
 from cvcdepth_ros.demo.result import DemoResult
@@ -141,8 +140,9 @@ def _show(setup: Setup, paths: DemoPaths, outcome: LiveOutcome) -> DemoResult:
         received = ReceivedSets(paths.recording, setup.outputs, sets)
         lidar = RecordedLidar(recording, setup.layout)
         writer = SheetWriter(setup.layout.complete(), lidar, paths.sheets, setup.notes(outcome), setup.model.untrained)
-        for _ in tqdm(writer.write(received, len(sets)), desc="drawing", total=outcome.node.published, disable=None):
-            pass
+        with progress_bar(outcome.node.published, "sets", label="drawing", decimals=0) as show:
+            for number, _ in enumerate(writer.write(received, len(sets)), 1):
+                show(number)
     result = DemoResult(
         version=package_version(),
         recording=str(setup.recording),

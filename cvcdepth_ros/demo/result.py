@@ -5,7 +5,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
-from cvcdepth_ros.commands.arguments import table
+from cvcdepth_ros.console import table
 from cvcdepth_ros.messages.node_report import NodeReport
 
 UNTRAINED_WARNING = "UNTRAINED NETWORK: this depth means nothing"

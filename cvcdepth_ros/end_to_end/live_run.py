@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
+from cvcdepth_ros.console import progress_bar
 from cvcdepth_ros.end_to_end.paths import DemoPaths
 from cvcdepth_ros.end_to_end.processes import Child, Children, DemoError, wait_until
 from cvcdepth_ros.end_to_end.received import Output
@@ -93,10 +92,10 @@ class LiveRun:
 
     def _follow(self, player: Child) -> None:
         """Wait for the player's end, showing how many sets have been published."""
-        with tqdm(desc="playing", bar_format="{desc}: {n_fmt} sets published, {elapsed}", disable=None) as bar:
+        with progress_bar(None, "sets published", label="playing", decimals=0) as show:
             while not player.ended():
                 self._read_reports()
-                bar.update(self._published() - bar.n)
+                show(self._published())
 
     def _end(self, player: Child, rate: float) -> LiveOutcome:
         """Stop the recorder, which then says what it has."""

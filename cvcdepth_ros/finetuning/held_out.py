@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from cvcdepth_core.training.config import TrainingConfig
 from cvcdepth_ros.bags import open_recording
+from cvcdepth_ros.console import progress_bar
 from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings, unique_names
 from cvcdepth_ros.evaluation.result import EvaluationResult
 from cvcdepth_ros.evaluation.workers import KeptParts, evaluate_all
@@ -20,7 +20,6 @@ from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS
 from cvcdepth_ros.training_data.index import RecordingIndex
 from cvcdepth_ros.training_data.samples import first_held_out
 
-_BAR = "{desc}: {percentage:3.0f}%|{bar}| {n:.1f} of {total} recordings [{elapsed}<{remaining}]"
 _FEWEST_SETS = 2  # the scores along the way need two
 
 
@@ -88,7 +87,7 @@ def some_sets(parts: Sequence[HeldOutPart], most: int) -> list[EvaluationJob]:
 
 
 def evaluate(
-    jobs: Sequence[EvaluationJob], checkpoint: Path, folder: Path | None = None, label: str | None = None
+    jobs: Sequence[EvaluationJob], checkpoint: Path, folder: Path | None = None, label: str = ""
 ) -> EvaluationResult:
     """Score a checkpoint file; what `folder` holds of the very same work is not done again.
 
@@ -98,10 +97,6 @@ def evaluate(
     ready = [replace(job, settings=settings) for job in jobs]
     depends_on = settings.dependencies()
     kept = None if folder is None else KeptParts(folder, depends_on)
-    with tqdm(total=len(jobs), desc=label, disable=None if label else True, bar_format=_BAR, leave=False) as bar:
-
-        def show(done: float) -> None:
-            bar.update(done - bar.n)
-
+    with progress_bar(len(jobs), "recordings", label=label, quiet=not label, is_kept=False) as show:
         outcomes = [outcome for _, outcome in evaluate_all(ready, kept=kept, progress=show)]
     return EvaluationResult.of(ready, outcomes, depends_on)

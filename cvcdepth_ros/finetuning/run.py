@@ -166,7 +166,7 @@ def _forget_former_run(run: Path) -> None:
 
 
 def _scored(order: Order, parts: list[HeldOutPart], weights: Path, when: str) -> EvaluationResult:
-    label = None if order.quiet else f"held-out part, {when}"
+    label = "" if order.quiet else f"held-out part, {when}"
     return evaluate([part.job for part in parts], weights, order.run / _SCORES_FOLDER / when, label)
 
 

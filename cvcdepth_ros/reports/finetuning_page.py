@@ -24,8 +24,6 @@ from cvcdepth_ros.reports.evaluation_page import chosen_sets, drawn_again, to_da
 from cvcdepth_ros.reports.evaluation_pictures import SetPictures
 from cvcdepth_ros.reports.learning_curves import RunLog, held_out_curves, loss_curves
 
-REPORT_FILE = "report.html"
-
 _MASK_WIDTH = 480
 
 
