@@ -147,10 +147,10 @@ def _result(
     arguments: argparse.Namespace, settings: EvaluationSettings, jobs: Sequence[EvaluationJob], folder: Path
 ) -> "EvaluationResult":
     from cvcdepth_ros.evaluation.result import EvaluationResult, Failure
-    from cvcdepth_ros.evaluation.workers import KeptParts, evaluate_all
+    from cvcdepth_ros.evaluation.workers import KeptScores, evaluate_all
 
     depends_on = settings.dependencies()
-    kept = KeptParts(folder / _PARTS, depends_on)
+    kept = KeptScores(folder / _PARTS, depends_on)
     outcomes = []
     with _pool(arguments, settings) as pool, progress_bar(len(jobs), "recordings", quiet=arguments.quiet) as progress:
         for job, outcome in evaluate_all(jobs, arguments.workers or 1, kept, progress, pool):

@@ -3,9 +3,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import io
-import json
 import logging
 import multiprocessing
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -13,62 +10,50 @@ from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_complet
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-from zipfile import BadZipFile
-
-import numpy as np
 
 from cvcdepth_core.errors import CvcDepthError
-from cvcdepth_core.files import write_atomically
 from cvcdepth_ros.bags import file_identities
 from cvcdepth_ros.evaluation.job import Dependencies, EvaluationJob
 from cvcdepth_ros.evaluation.measuring import Progress, RecordingScores, evaluate_recording
 from cvcdepth_ros.evaluation.result import Failure
+from cvcdepth_ros.kept import KeptResults, Work
 
 Outcome = RecordingScores | Failure
 
 _logger = logging.getLogger(__name__)
 
 
-class KeptParts:
-    """The finished recordings' scores, one file each, which hold for the very same work only."""
+class KeptScores:
+    """The finished recordings' scores, which hold for the very same recording, settings, program and checkpoint."""
 
     def __init__(self, folder: Path, depends_on: Dependencies) -> None:
-        self._folder = folder
+        self._results = KeptResults(folder, RecordingScores.to_arrays, RecordingScores.from_arrays)
         self._depends_on = depends_on
 
     def load(self, job: EvaluationJob) -> RecordingScores | None:
-        """Return the scores of a former run; None where there are none, or of another work."""
-        try:
-            with np.load(self._path(job), allow_pickle=False) as arrays:
-                known = json.loads(arrays["work"].tobytes()) == self._work(job)
-                return RecordingScores.from_arrays(arrays) if known else None
-        except (OSError, ValueError, KeyError, TypeError, BadZipFile, CvcDepthError):
-            return None  # not there, or cut by whatever ended the former run: then the work is done again
+        """Return the scores of a former call; None where there are none, or of other work."""
+        work = self._work(job)
+        return None if work is None else self._results.load(job.name, work)
 
     def save(self, job: EvaluationJob, scores: RecordingScores) -> None:
-        """Keep the scores; the file appears whole or not at all."""
-        try:
-            work = self._work(job)
-        except OSError:
-            return  # the recording cannot be reached any more, so nobody can know it again
-        self._folder.mkdir(parents=True, exist_ok=True)
-        content = io.BytesIO()
-        arrays: dict[str, Any] = {"work": np.frombuffer(json.dumps(work).encode(), dtype=np.uint8)} | scores.to_arrays()
-        np.savez(content, **arrays)
-        write_atomically(self._path(job), content.getvalue())
+        """Keep the scores; not those of a recording that cannot be reached any more, which nobody could know again."""
+        work = self._work(job)
+        if work is not None:
+            self._results.save(job.name, work, scores)
 
-    def _path(self, job: EvaluationJob) -> Path:
-        return self._folder / f"{hashlib.sha256(job.name.encode()).hexdigest()[:16]}.npz"
-
-    def _work(self, job: EvaluationJob) -> dict[str, Any]:
+    def _work(self, job: EvaluationJob) -> Work | None:
+        """Return all that the job's scores depend on; None where its files cannot be reached."""
         masks = [str(camera.mask) for camera in job.layout.cameras if camera.mask] if job.layout else []
+        try:
+            files = [identity for path in (job.path, *masks) for identity in file_identities(path)]
+        except (OSError, CvcDepthError):
+            return None
         return {
             **self._depends_on._asdict(),
             "configuration": job.configuration(),
             "name": job.name,
             "path": job.path,
-            "files": [identity for path in (job.path, *masks) for identity in file_identities(path)],
+            "files": files,
         }
 
 
@@ -87,7 +72,7 @@ class Pool:
 def evaluate_all(
     jobs: Sequence[EvaluationJob],
     workers: int = 1,
-    kept: KeptParts | None = None,
+    kept: KeptScores | None = None,
     progress: Progress | None = None,
     pool: Pool | None = None,
 ) -> Iterator[tuple[EvaluationJob, Outcome]]:

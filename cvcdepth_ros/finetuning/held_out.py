@@ -15,7 +15,7 @@ from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.console import progress_bar
 from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings, unique_names
 from cvcdepth_ros.evaluation.result import EvaluationResult
-from cvcdepth_ros.evaluation.workers import KeptParts, evaluate_all
+from cvcdepth_ros.evaluation.workers import KeptScores, evaluate_all
 from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS
 from cvcdepth_ros.training_data.index import RecordingIndex
 from cvcdepth_ros.training_data.samples import first_held_out
@@ -96,7 +96,7 @@ def evaluate(
     settings = jobs[0].settings.model_copy(update={"checkpoint": str(checkpoint)})
     ready = [replace(job, settings=settings) for job in jobs]
     depends_on = settings.dependencies()
-    kept = None if folder is None else KeptParts(folder, depends_on)
+    kept = None if folder is None else KeptScores(folder, depends_on)
     with progress_bar(len(jobs), "recordings", label=label, quiet=not label, is_kept=False) as show:
         outcomes = [outcome for _, outcome in evaluate_all(ready, kept=kept, progress=show)]
     return EvaluationResult.of(ready, outcomes, depends_on)

@@ -18,6 +18,7 @@ from cvcdepth_core.rig.rig import RigLayout
 from cvcdepth_ros.bags import Location, file_identities, open_recording
 from cvcdepth_ros.checks import CheckContext, CheckOptions, CheckResult, NumberedResult, run_checks
 from cvcdepth_ros.installation import package_version
+from cvcdepth_ros.kept import Arrays, KeptResults, document_array, read_document
 from cvcdepth_ros.settings import MatchingSettings
 from cvcdepth_ros.training_data.index import RecordingIndex, load_index
 from cvcdepth_ros.training_data.own_body_masks import find_self_occlusion, save_masks
@@ -77,36 +78,32 @@ def prepare(source: Source, run: Path) -> Prepared:
 
 
 def checked(path: Location, source: Source, run: Path) -> list[NumberedResult]:
-    """Run the checks of `bag_replay check`, or return what they found before in the very same recording and rig."""
-    matching = source.matching
+    """Return the results of `cvcdepth check`, found now, or before in the very same recording and rig."""
+    matching, layout = source.matching, source.layout
     options = CheckOptions(tolerance=matching.tolerance, queue_size=matching.queue_size, lidar=source.lidar)
-    layout = source.layout
-    key = {
+    work = {
         "version": package_version(),
         "files": file_identities(path),
         "options": asdict(options),
         "skipped": sorted(source.skipped_checks),
         "rig": None if layout is None else layout.model_dump(mode="json"),
     }
-    kept = run / _CHECKS_FOLDER / f"{path.name}-{_digest(str(path))}.json"
-    found = _read(kept, _digest(json.dumps(key)))
-    if found is None:
+
+    def run_all() -> list[NumberedResult]:
         with open_recording(path) as recording:
-            found = run_checks(CheckContext(recording, options, layout), source.skipped_checks)
-        kept.parent.mkdir(parents=True, exist_ok=True)
-        content = {"key": _digest(json.dumps(key)), "checks": [(n, name, asdict(result)) for n, name, result in found]}
-        write_atomically(kept, json.dumps(content).encode())
-    return found
+            return run_checks(CheckContext(recording, options, layout), source.skipped_checks)
+
+    kept = KeptResults(run / _CHECKS_FOLDER, _checks_to_arrays, _checks_from_arrays)
+    return kept.load_or_make(str(path), work, run_all)
 
 
-def _read(kept: Path, key: str) -> list[NumberedResult] | None:
-    try:
-        content = json.loads(kept.read_text(encoding="utf-8"))
-        if content["key"] != key:
-            return None
-        return [NumberedResult(number, name, CheckResult(**result)) for number, name, result in content["checks"]]
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
+def _checks_to_arrays(checks: list[NumberedResult]) -> Arrays:
+    return {"checks": document_array([(number, name, asdict(result)) for number, name, result in checks])}
+
+
+def _checks_from_arrays(arrays: Arrays) -> list[NumberedResult]:
+    found = read_document(arrays["checks"])
+    return [NumberedResult(number, name, CheckResult(**result)) for number, name, result in found]
 
 
 def _refuse(path: Location, problems: Sequence[NumberedResult]) -> None:
@@ -138,7 +135,10 @@ def _add_masks(prepared: Prepared, run: Path) -> None:
 
 
 def _masked(index: RecordingIndex, run: Path) -> RigLayout:
-    """Return the layout with the masks that were found in the recording, now or before."""
+    """Return the layout with the masks that were found in the recording, now or before.
+
+    Pictures, found again by the rig alone: whoever paints over one must not lose it to another version of the program.
+    """
     layout = index.layout
     folder = run / _MASKS_FOLDER / _digest(layout.model_dump_json())
     try:
