@@ -15,9 +15,9 @@ from cvcdepth_ros.demo.recorded_lidar import RecordedLidar
 from cvcdepth_ros.demo.result import UNTRAINED_WARNING, DemoResult
 from cvcdepth_ros.end_to_end.received import ReceivedSet
 from cvcdepth_ros.reports.animation_page import Table, animation_page
+from cvcdepth_ros.reports.style import to_jpeg
 from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS
 
-_JPEG_QUALITY = 85
 _PNG_COMPRESSION = 6
 
 
@@ -38,8 +38,8 @@ class SheetWriter:
         for surround in received:
             sheet = self._draw(surround, total)
             path = self._folder / f"set_{surround.sent.sequence + 1:03d}.png"
-            path.write_bytes(_encoded(sheet, ".png", cv2.IMWRITE_PNG_COMPRESSION, _PNG_COMPRESSION))
-            self.jpegs.append(_encoded(sheet, ".jpg", cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY))
+            path.write_bytes(_png(sheet))
+            self.jpegs.append(to_jpeg(sheet))
             yield path
 
     def page(self, title: str, result: DemoResult) -> str:
@@ -71,6 +71,7 @@ class SheetWriter:
         return points, f"{seen}, {'LiDAR in cyan' if points is not None else 'no LiDAR recorded'}"
 
 
-def _encoded(picture: Picture, extension: str, option: int, value: int) -> bytes:
-    _, encoded = cv2.imencode(extension, np.ascontiguousarray(picture[..., ::-1]), [option, value])
+def _png(picture: Picture) -> bytes:
+    options = [cv2.IMWRITE_PNG_COMPRESSION, _PNG_COMPRESSION]
+    _, encoded = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]), options)
     return bytes(encoded)

@@ -35,7 +35,7 @@ from cvcdepth_ros.evaluation.measuring import RecordingScores, open_evaluation
 from cvcdepth_ros.evaluation.result import Failure
 from cvcdepth_ros.evaluation.workers import evaluate_all
 from cvcdepth_ros.recordings.replay import DepthReplay
-from cvcdepth_ros.reports.evaluation_page import chosen_sets
+from cvcdepth_ros.reports.shown_sets import chosen_sets
 
 SMALL = ("--untrained", "--height", "64", "--width", "96")
 CONSTANT = ("--predictor", "constant", "--height", "64", "--width", "96")
