@@ -18,11 +18,17 @@ if TYPE_CHECKING:
     from cvcdepth_core.pointcloud import CloudLimits
 
 
+SET_TOLERANCE = 0.1
+"""Seconds that two images of one set may be apart, where nothing else is asked for."""
+QUEUE_SIZE = 10
+"""Images that are kept per camera while their set is not complete, where nothing else is asked for."""
+
+_UNTRAINED_DEPTHS = (1.5, 200.0)  # metres: least and greatest depth of a network with random weights
 _SMALLEST_VOXEL = 0.01
 
 
 class Settings(BaseModel):
-    """Frozen, and nothing may be misspelt."""
+    """Base of all settings: immutable; unknown fields are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
@@ -58,13 +64,13 @@ class ModelSettings(Settings):
 
     @property
     def notice(self) -> str:
-        """What must be said of the network's depth; nothing about a checkpoint of the user's own."""
+        """A warning about what the network's depth is worth; empty for a checkpoint of the user's own."""
         if self.untrained:
             return "untrained: the network has random weights, and its depth means nothing"
         return NOTICE if self.checkpoint in ("", DEFAULT) else ""
 
     def build_estimator(self) -> "DepthEstimator":
-        """Load the checkpoint, or make the untrained network; CheckpointError or ConfigError says what is wrong."""
+        """Return the checkpoint's network, or an untrained one; CheckpointError or ConfigError says what is wrong."""
         from cvcdepth_core.estimator import DepthEstimator
         from cvcdepth_core.networks.checkpoint import DepthModelSpec, check_sha256
 
@@ -74,8 +80,9 @@ class ModelSettings(Settings):
             check_sha256(path, self.checkpoint_sha256)
             return DepthEstimator.from_checkpoint(path, self.device, **engine)
         try:
+            least, greatest = _UNTRAINED_DEPTHS
             spec = DepthModelSpec(
-                encoder=self.encoder, height=self.height, width=self.width, min_depth=1.5, max_depth=200.0
+                encoder=self.encoder, height=self.height, width=self.width, min_depth=least, max_depth=greatest
             )
         except ValidationError as error:
             raise ConfigError(f"parameter {first_validation_message(error)}") from error
@@ -85,21 +92,21 @@ class ModelSettings(Settings):
 class MatchingSettings(Settings):
     """Which images make a surround set."""
 
-    tolerance: float = Field(default=0.1, gt=0, le=10)
+    tolerance: float = Field(default=SET_TOLERANCE, gt=0, le=10)
     """Seconds that two images of one set may be apart."""
-    queue_size: int = Field(default=10, ge=2, le=1000)
+    queue_size: int = Field(default=QUEUE_SIZE, ge=2, le=1000)
     """Images that are kept per camera while their set is not complete."""
 
 
 class MissingCameraSettings(Settings):
-    """What becomes of sets when cameras fail."""
+    """How many cameras a set needs."""
 
     min_cameras: int = Field(0, ge=0, le=64)
     """Cameras without which no set is made: with fewer than all, dead cameras are left out; 0 holds such sets back."""
 
 
 class OutputSettings(Settings):
-    """What the depth images and clouds are like."""
+    """Encoding of the depth images and limits of the merged cloud."""
 
     depth_encoding: Literal["32FC1", "16UC1"] = "32FC1"
     """Encoding of depth images: 32FC1 metres with NaN for unknown, or 16UC1 millimetres with 0 (REP 118)."""
@@ -121,7 +128,7 @@ class OutputSettings(Settings):
 
     @property
     def cloud_limits(self) -> "CloudLimits":
-        """The merged cloud's limits."""
+        """Which points the merged cloud keeps."""
         from cvcdepth_core.pointcloud import CloudLimits
 
         return CloudLimits(self.cloud_stride, self.cloud_min_range, self.cloud_max_range, self.cloud_voxel)

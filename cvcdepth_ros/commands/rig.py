@@ -58,7 +58,7 @@ def execute(arguments: argparse.Namespace) -> None:
             refuse_to_overwrite(*(folder / f"{name}.png" for name in layout.names))
         layout = _with_found_masks(layout, path, folder)
     result = _describe(layout, layout.complete())
-    source = f"bag_replay rig {package_version()}, from the recording {path.name}"
+    source = f"cvcdepth rig {package_version()}, from the recording {path.name}"
     save_rig_layout(arguments.output, layout, f"Written by {source}.\n{_overlaps_text(result)}")
     result = {"file": str(arguments.output), "recording": arguments.recording, **result}
     print_result(result, _text(result), arguments.json)

@@ -174,7 +174,7 @@ class StaticTransformInput:
         except ImportError as error:
             raise ConfigError(
                 "the rig file leaves base_T_camera to /tf_static, but tf2_msgs is not installed here; "
-                "write a complete rig file with: bag_replay rig BAG -o rig.yaml"
+                "write a complete rig file with: cvcdepth rig BAG -o rig.yaml"
             ) from error
         self._node, self._tree, self._on_change = node, tree, on_change
         qos = QoSProfile(

@@ -134,7 +134,7 @@ def _complete_layout(recording: Recording, layout: RigLayout | None) -> RigLayou
     if lonely:
         raise RigError(
             f"{recording.path}: camera {', '.join(lonely)}: shares no view with another camera, so there is no overlap "
-            "to learn metric depth from; `bag_replay rig` shows the overlaps"
+            "to learn metric depth from; `cvcdepth rig` shows the overlaps"
         )
     return complete
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`bag_replay evaluate`: the depth that is scored, scores by strangers' arithmetic, many recordings, the page."""
+"""`cvcdepth evaluate`: the depth that is scored, scores by strangers' arithmetic, many recordings, the page."""
 
 import csv
 import hashlib

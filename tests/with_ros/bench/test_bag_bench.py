@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`bag_replay bench` over real DDS, at the smallest size that means anything."""
+"""`cvcdepth bench` over real DDS, at the smallest size that means anything."""
 
 import json
 from collections.abc import Iterator
