@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole node: recording -> topics -> node -> subscriber over DDS, against the straightforward node.
+"""The whole node: recording -> topics -> node -> subscriber over DDS, against the baseline node.
 
     .venv/bin/python benchmarks/node.py [--height 192 --width 320] [--seconds 20] [--rate 2]
 

@@ -20,7 +20,7 @@ NEEDS_ROS = {
     *(path for path in (ROOT / "cvcdepth_ros" / "node").glob("*.py") if path.name != "__init__.py"),
     *(
         ROOT / "cvcdepth_ros" / f"{name}.py"
-        for name in ("surround_depth_node", "bench/straightforward_node", "commands/play", "end_to_end/recorder")
+        for name in ("surround_depth_node", "bench/baseline_node", "commands/play", "end_to_end/recorder")
     ),
 }
 WITHOUT_ROS = [*CORE, *(path for path in sorted((ROOT / "cvcdepth_ros").rglob("*.py")) if path not in NEEDS_ROS)]
