@@ -85,7 +85,7 @@ class BaselineNode(Node):  # type: ignore[misc] # rclpy is not annotated
 
     def _publish_diagnostics(self) -> None:
         statuses = [
-            self._synchronisation.of(self._synchroniser.statistics(), MailboxStatistics(), self._counters),
+            self._synchronisation.status(self._synchroniser.statistics(), MailboxStatistics(), self._counters),
             inference_status(self._latencies.summaries(), MailboxStatistics(), "", self._estimator.model_id),
         ]
         for entry in statuses:

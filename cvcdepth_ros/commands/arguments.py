@@ -134,7 +134,7 @@ def window_ns(arguments: argparse.Namespace, recording_start: int) -> tuple[int,
 def recording_progress(
     recording: "Recording", window: tuple[int, int | None], quiet: bool
 ) -> Iterator[Callable[[int], None]]:
-    """Show on a terminal how much of the window is read; what is given is to be called with log times (ns)."""
+    """Show on a terminal how much of the window is read; give a function to be called with the log times (ns) read."""
     start, stop = window[0], min(window[1] or recording.end, recording.end)
     seconds = (stop - start) / 1e9
     with progress_bar(seconds, "s recorded", quiet=quiet, is_kept=False) as show:

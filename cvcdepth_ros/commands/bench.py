@@ -93,7 +93,7 @@ def _write_parameters(paths: "DemoPaths", model: ModelSettings) -> None:
 
 
 def _figures(paths: "DemoPaths", anchor: str, info: str, outcome: "LiveOutcome") -> dict[str, Any]:
-    """Say how often depth came, how old it was, and where the time went.
+    """Return the intervals between sets, the age of depth, and the latency of each stage, in milliseconds.
 
     Ages are those of the anchor's depth: from its camera_info's arrival at the subscriber to its own.
     """

@@ -163,7 +163,7 @@ def _result(
     models = sorted({outcome.summary["model"] for outcome in outcomes if not isinstance(outcome, Failure)})
     if len(models) > 1:
         warn(f"the recordings were not evaluated alike: {' and '.join(models)}")
-    return EvaluationResult.of(jobs, outcomes, depends_on)
+    return EvaluationResult.from_outcomes(jobs, outcomes, depends_on)
 
 
 def _pool(arguments: argparse.Namespace, settings: EvaluationSettings) -> "AbstractContextManager[Pool | None]":

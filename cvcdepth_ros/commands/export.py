@@ -81,7 +81,7 @@ def _build_tensorrt(
 
 
 def _description(checkpoint: "Checkpoint") -> dict[str, Any]:
-    """Say what a program needs to use the model."""
+    """Return what a program has to know to use the model."""
     return {
         "version": package_version(),
         "checkpoint": checkpoint.path.name,

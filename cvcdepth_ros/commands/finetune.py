@@ -21,7 +21,7 @@ from cvcdepth_ros.reports import REPORT_FILE, can_draw_report
 
 if TYPE_CHECKING:
     from cvcdepth_core.training.distributed import Processes
-    from cvcdepth_ros.finetuning.run import FineTuned, Order
+    from cvcdepth_ros.finetuning.run import FinetuneJob, FinetuneResult
 
 SUMMARY = """Train depth from recordings, without labels, and prove that it got better.
 
@@ -67,37 +67,37 @@ def execute(arguments: argparse.Namespace) -> None:
     refuse_unknown_checks(arguments)
     with launched_processes() as processes:
         with_report = processes.is_first and can_draw_report()
-        tuned = _fine_tuned(arguments, processes)
-    if tuned is None:
+        finished = _fine_tuned(arguments, processes)
+    if finished is None:
         return
-    result = _written(tuned, with_report)
+    result = _written(finished, with_report)
     print_result(result, _text(result), arguments.json)
-    if not tuned.verdict.promoted:
-        raise NotPromotedError(f"{arguments.output / BEST_FILE} is not written: {tuned.verdict.reason}")
+    if not finished.verdict.promoted:
+        raise NotPromotedError(f"{arguments.output / BEST_FILE} is not written: {finished.verdict.reason}")
 
 
-def _fine_tuned(arguments: argparse.Namespace, processes: "Processes") -> "FineTuned | None":
+def _fine_tuned(arguments: argparse.Namespace, processes: "Processes") -> "FinetuneResult | None":
     from cvcdepth_ros.finetuning.run import fine_tune
     from cvcdepth_ros.finetuning.tensorboard import WITHOUT_TENSORBOARD, has_tensorboard
 
-    order = _order(arguments)
+    job = _job(arguments)
     if processes.is_first and not has_tensorboard():
         warn(WITHOUT_TENSORBOARD)
     try:
-        return fine_tune(order, processes, warn)
+        return fine_tune(job, processes, warn)
     except KeyboardInterrupt:
         warn("interrupted; the same command goes on from the last checkpoint")
         raise
 
 
-def _order(arguments: argparse.Namespace) -> "Order":
+def _job(arguments: argparse.Namespace) -> "FinetuneJob":
     from cvcdepth_core.model_choices import checkpoint_path
     from cvcdepth_core.networks.checkpoint import load_checkpoint
     from cvcdepth_core.rig.rig import load_rig_layout
     from cvcdepth_core.training.config import load_training_config
     from cvcdepth_ros.bags import find_recordings
     from cvcdepth_ros.finetuning.preparation import Source
-    from cvcdepth_ros.finetuning.run import Order
+    from cvcdepth_ros.finetuning.run import FinetuneJob
     from cvcdepth_ros.settings import MatchingSettings
 
     config = load_training_config(arguments.config)
@@ -112,22 +112,22 @@ def _order(arguments: argparse.Namespace) -> "Order":
         lidar_topics(arguments),
     )
     start = None if arguments.start is None else load_checkpoint(checkpoint_path(arguments.start))
-    return Order(source, config, arguments.output, start, arguments.device, arguments.quiet)
+    return FinetuneJob(source, config, arguments.output, start, arguments.device, arguments.quiet)
 
 
-def _written(tuned: "FineTuned", with_report: bool) -> dict[str, Any]:
+def _written(finished: "FinetuneResult", with_report: bool) -> dict[str, Any]:
     """Write the card, the page if wanted, and the result; return the result."""
     from cvcdepth_ros.finetuning.card import model_card, write_card
 
-    run, card = tuned.order.run, model_card(tuned)
+    run, card = finished.job.run, model_card(finished)
     write_card(run, card)
     if with_report:
         from cvcdepth_ros.reports.finetuning_page import write_report
 
-        write_report(run / REPORT_FILE, tuned, card)
+        write_report(run / REPORT_FILE, finished, card)
     shown = ("started_from", "version", "promoted", "verdict", "scores", "left_out", "warnings", "configuration")
     result = {
-        "checkpoint": str(tuned.weights),
+        "checkpoint": str(finished.weights),
         "sha256": card["weights"]["sha256"],
         "step": card["weights"]["step"],
         "recordings": card["data"],
@@ -154,16 +154,12 @@ def _text(result: dict[str, Any]) -> str:
 
 
 def _score_table(scores: dict[str, Any]) -> str:
-    from cvcdepth_ros.finetuning.card import SCORE_TITLES
+    from cvcdepth_ros.finetuning.card import SCORE_TITLES, score_pairs
 
     before, after = scores["before"]["cameras"], scores["after"]["cameras"]
     rows = [
-        (camera, *(_pair(numbers[name], after.get(camera, {}).get(name)) for name in SCORE_TITLES))
+        (camera, *score_pairs(numbers, after.get(camera, {}), arrow="->", unknown="-"))
         for camera, numbers in before.items()
     ]
     header = ("before -> after", *SCORE_TITLES.values())
     return table(header, rows, numbers=range(1, len(header)))
-
-
-def _pair(before: float | None, after: float | None) -> str:
-    return " -> ".join("-" if number is None else f"{number:.3f}" for number in (before, after))

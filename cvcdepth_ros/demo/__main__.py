@@ -58,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run(options: argparse.Namespace) -> DemoResult:
-    """Play, record, count, draw and tell."""
+    """Play the recording to the node, write what it publishes and print a summary; DemoError when a process fails."""
     model = _model(options)
     paths = DemoPaths(options.output)
     paths.prepare()
@@ -67,7 +67,7 @@ def run(options: argparse.Namespace) -> DemoResult:
     with children(paths.logs) as family:
         live = LiveRun(family, paths, NODE)
         live.write_rig(options.recording)
-        setup = Setup.of(options.recording, model, paths)
+        setup = Setup.from_rig_file(options.recording, model, paths)
         setup.write_parameters(paths)
         rate = options.rate or setup.manageable_rate()
         print(f"playing {setup.recording.name} at {rate:.3g} times real time")
@@ -81,18 +81,18 @@ def run(options: argparse.Namespace) -> DemoResult:
 
 @dataclass(frozen=True)
 class Setup:
-    """What is played, and how the node is set up for it."""
+    """The recording that is played, and the node's configuration for it."""
 
     recording: Path
     layout: RigLayout
     model: ModelSettings
     parameters: dict[str, Any]
-    """The node's."""
+    """The node's parameters."""
     outputs: list[Output]
 
     @classmethod
-    def of(cls, recording: Path, model: ModelSettings, paths: DemoPaths) -> "Setup":
-        """Set up for the rig file that was written before."""
+    def from_rig_file(cls, recording: Path, model: ModelSettings, paths: DemoPaths) -> "Setup":
+        """Return the setup for the rig file that `paths` names."""
         layout = load_rig_layout(paths.rig)
         parameters = {
             "use_sim_time": True,
@@ -109,7 +109,7 @@ class Setup:
         paths.parameters.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
 
     def manageable_rate(self) -> float:
-        """Measure how fast the recording may be played here."""
+        """Return how fast the recording may be played here, which is measured."""
         with open_recording(self.recording) as recording:
             return manageable_rate(recording, self.layout, self.model)
 
@@ -121,7 +121,7 @@ class Setup:
 
 
 def _model(options: argparse.Namespace) -> ModelSettings:
-    """Return the network that was asked for; ConfigError when it cannot be."""
+    """Return the network of the options; ConfigError names one with an impossible value."""
     if options.checkpoint:
         return ModelSettings.model_validate({"checkpoint": str(options.checkpoint.absolute())})
     if not options.untrained:
@@ -133,7 +133,7 @@ def _model(options: argparse.Namespace) -> ModelSettings:
 
 
 def _show(setup: Setup, paths: DemoPaths, outcome: LiveOutcome) -> DemoResult:
-    """Draw what arrived, count it, and write pictures, result and page."""
+    """Write pictures, result and page of what arrived; return the result."""
     with open_recording(setup.recording) as recording:
         sets = sent_sets(recording, setup.layout, SET_TOLERANCE, outcome.sent)
         received = ReceivedSets(paths.recording, setup.outputs, sets)

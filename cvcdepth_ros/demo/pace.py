@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How fast a recording may be played so that this machine manages every set."""
+"""The rate at which a recording may be played so that this machine keeps up with every set."""
 
 import os
 import time
@@ -19,7 +19,7 @@ _FASTEST, _SLOWEST_SECONDS = 1.0, 6.0
 
 
 def manageable_rate(recording: Recording, layout: RigLayout, model: ModelSettings) -> float:
-    """Return the rate at which the node has four times as long for a set as its inference takes.
+    """Return the rate at which a set's inference takes a quarter of the time until the next set.
 
     That is measured, with the node's own network on this machine; at most real time, at least a set in six seconds.
     """
@@ -31,7 +31,7 @@ def manageable_rate(recording: Recording, layout: RigLayout, model: ModelSetting
 
 
 def _inference_seconds(estimator: DepthEstimator, cameras: int) -> float:
-    """Time the estimator on one set of grey pictures; a first run, which sets things up, does not count."""
+    """Return the seconds of one set's inference, on grey pictures, after a first run that builds what is reused."""
     pictures = [np.full((estimator.spec.height, estimator.spec.width, 3), 127, dtype=np.uint8)] * cameras
     focal_lengths = np.full(cameras, float(estimator.spec.width))
     if THREADS_VARIABLE not in os.environ:

@@ -25,7 +25,7 @@ class SheetWriter:
     """Draws sets, writes each as PNG, and keeps a JPEG of each for the page."""
 
     def __init__(self, rig: Rig, lidar: RecordedLidar, folder: Path, notes: list[str], untrained: bool) -> None:
-        """Draw for one rig and recording into `folder`; `notes` are the last lines below every picture."""
+        """Draw sets of one rig and recording into `folder`, with `notes` as the last lines below each."""
         self._rig = rig
         self._lidar = lidar
         self._folder = folder
@@ -34,7 +34,7 @@ class SheetWriter:
         self.jpegs: list[bytes] = []
 
     def write(self, received: Iterable[ReceivedSet], total: int) -> Iterator[Path]:
-        """Draw one set after the other; `total` is the number of sets that were sent. Gives the files."""
+        """Draw one set after the other and give the files; `total` is the number of sets that were sent."""
         for surround in received:
             sheet = self._draw(surround, total)
             path = self._folder / f"set_{surround.sent.sequence + 1:03d}.png"
@@ -43,7 +43,7 @@ class SheetWriter:
             yield path
 
     def page(self, title: str, result: DemoResult) -> str:
-        """Return the HTML page of all that was written."""
+        """Return the HTML page with all sets that were drawn, and the result's tables."""
         tables: list[Table] = [("What became of it", result.counts()), ("Latency, ms: p50, p95", result.latencies())]
         return animation_page(title, UNTRAINED_WARNING if self._untrained else "", self.jpegs, tables, self._notes)
 

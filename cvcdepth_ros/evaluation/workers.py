@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many recordings, each a unit of work: in this process or in several, finished ones kept for the next run."""
+"""Evaluation of many recordings, one after the other or several at a time; finished ones are kept for the next call."""
 
 from __future__ import annotations
 
@@ -59,14 +59,14 @@ class KeptScores:
 
 @dataclass(frozen=True)
 class Pool:
-    """Where recordings are evaluated at the same time."""
+    """Workers that evaluate several recordings at the same time."""
 
     open: Callable[[int], Executor]
-    """Gives an executor for so many at a time."""
+    """Returns an executor for this many recordings at a time."""
     died: tuple[type[Exception], ...]
-    """What a call's future raises when the worker dies."""
+    """The exceptions of a call's future when its worker dies."""
     work: Callable[[EvaluationJob], Outcome]
-    """Evaluates one recording over there."""
+    """Evaluates one recording, in a worker."""
 
 
 def evaluate_all(
@@ -76,11 +76,11 @@ def evaluate_all(
     progress: Progress | None = None,
     pool: Pool | None = None,
 ) -> Iterator[tuple[EvaluationJob, Outcome]]:
-    """Evaluate recordings and give each as soon as it is finished: in this process, or several at a time in a pool.
+    """Evaluate recordings, in this process or several at a time in a pool; give each as soon as it is finished.
 
     The pool is `workers` processes of this machine unless another is given. A recording that fails, whatever the
-    reason, is a `Failure` and stops no other. What `kept` has is not done again. `progress` is told how many recordings
-    are done.
+    reason, is a `Failure` and stops no other. Recordings that `kept` has are not evaluated again. `progress` is called
+    with the number of recordings that are done.
     """
     done = 0
     missing = []
@@ -105,7 +105,7 @@ def evaluate_all(
 
 
 def evaluate_safely(job: EvaluationJob, progress: Progress | None = None) -> Outcome:
-    """Evaluate a recording; whatever goes wrong becomes a `Failure`."""
+    """Return a recording's scores, or a `Failure` whatever goes wrong."""
     try:
         return evaluate_recording(job, progress)
     except (CvcDepthError, OSError) as error:
@@ -116,7 +116,7 @@ def evaluate_safely(job: EvaluationJob, progress: Progress | None = None) -> Out
 
 
 def _in_pool(pool: Pool, jobs: Sequence[EvaluationJob], workers: int) -> Iterator[tuple[EvaluationJob, Outcome]]:
-    """Where a worker dies, jobs that it took with it are done again, each in an executor of its own."""
+    """Give the outcomes of jobs; those that a dying worker took with it are tried again, each in its own executor."""
     lost = []
     for job, outcome in _with_executor(pool, min(workers, len(jobs)), jobs):
         if outcome is None:
@@ -131,7 +131,7 @@ def _in_pool(pool: Pool, jobs: Sequence[EvaluationJob], workers: int) -> Iterato
 def _with_executor(
     pool: Pool, workers: int, jobs: Iterable[EvaluationJob]
 ) -> Iterator[tuple[EvaluationJob, Outcome | None]]:
-    """Hand the jobs to an executor; None is what became of a job whose worker died."""
+    """Give the outcomes of jobs, None where the worker died."""
     executor = pool.open(workers)
     try:
         futures: dict[Future[Outcome], EvaluationJob] = {executor.submit(pool.work, job): job for job in jobs}
@@ -148,7 +148,7 @@ def _with_executor(
 
 
 def _processes(workers: int) -> ProcessPoolExecutor:
-    """Return fresh interpreters: a forked one would inherit torch's threads and CUDA in a state that does not work."""
+    """Return an executor of fresh interpreters: a forked one would inherit torch's threads and CUDA in a bad state."""
     return ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
 
 

@@ -20,7 +20,7 @@ from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS
 from cvcdepth_ros.training_data.index import RecordingIndex
 from cvcdepth_ros.training_data.samples import first_held_out
 
-_FEWEST_SETS = 2  # the scores along the way need two
+_FEWEST_SETS = 2  # the label-free scores from set to set need two
 
 
 @dataclass(frozen=True)
@@ -28,14 +28,14 @@ class HeldOutPart:
     """The last sets of one recording, which are never trained on."""
 
     job: EvaluationJob
-    """All of it."""
+    """The evaluation of the whole part."""
     recording_start: int
     """Log time of the recording's first message, ns."""
     spans: tuple[tuple[int, int], ...]
     """First and last log time of each set, ns."""
 
-    def between(self, first: int, count: int) -> EvaluationJob:
-        """Return the job that takes `count` sets from the `first` on."""
+    def job_of_sets(self, first: int, count: int) -> EvaluationJob:
+        """Return the job of `count` sets from number `first` of the part on."""
         start, stop = self.spans[first][0], max(last for _, last in self.spans[first : first + count]) + 1
         seconds = (start - self.recording_start) / NANOSECONDS
         return replace(self.job, start=seconds, duration=(stop - start) / NANOSECONDS)
@@ -72,24 +72,27 @@ def _held_out_part(index: RecordingIndex, job: EvaluationJob, config: TrainingCo
         start = recording.start
     spans = tuple((int(times.min()), int(times.max())) for times in log_times)
     part = HeldOutPart(job, start, spans)
-    return replace(part, job=part.between(0, len(spans)))
+    return replace(part, job=part.job_of_sets(0, len(spans)))
 
 
-def some_sets(parts: Sequence[HeldOutPart], most: int) -> list[EvaluationJob]:
-    """Return jobs of `most` sets at most: some consecutive ones in the middle of each part, or of some of the parts."""
+def validation_jobs(parts: Sequence[HeldOutPart], most: int) -> list[EvaluationJob]:
+    """Return jobs of `most` sets in all, or the fewest that can be scored; a run is followed by their scores.
+
+    They are consecutive sets in the middle of each part, or of some of the parts where there are many.
+    """
     chosen = [parts[i] for i in np.unique(np.linspace(0, len(parts) - 1, max(1, most // _FEWEST_SETS)).astype(int))]
     share = max(_FEWEST_SETS, most // len(chosen))
     jobs = []
     for part in chosen:
         count = min(share, len(part.spans))
-        jobs.append(part.between((len(part.spans) - count) // 2, count))
+        jobs.append(part.job_of_sets((len(part.spans) - count) // 2, count))
     return jobs
 
 
-def evaluate(
+def evaluate_checkpoint(
     jobs: Sequence[EvaluationJob], checkpoint: Path, folder: Path | None = None, label: str = ""
 ) -> EvaluationResult:
-    """Score a checkpoint file; what `folder` holds of the very same work is not done again.
+    """Return a checkpoint file's scores; those that are kept in `folder` are not measured again.
 
     With a `label` there is a progress bar on terminals. Raises RecordingError when no recording can be evaluated.
     """
@@ -99,4 +102,4 @@ def evaluate(
     kept = None if folder is None else KeptScores(folder, depends_on)
     with progress_bar(len(jobs), "recordings", label=label, quiet=not label, is_kept=False) as show:
         outcomes = [outcome for _, outcome in evaluate_all(ready, kept=kept, progress=show)]
-    return EvaluationResult.of(ready, outcomes, depends_on)
+    return EvaluationResult.from_outcomes(ready, outcomes, depends_on)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What has to be right and known before the first step: checks, indexes, and masks of the vehicle's own body.
+"""The recordings of a run made ready before its first step: checked, indexed, the vehicle's own body masked.
 
-Everything is kept in the run's folder, so that the same command again, and the other processes of a run, find it there.
+All of it is kept in the run's folder, so that the same command again, and the other processes of a run, find it there.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _CHECKS_FOLDER, _INDEX_FOLDER, _MASKS_FOLDER, _FOUND_FILE = "checks", "index", "
 
 @dataclass(frozen=True)
 class Source:
-    """What to train on."""
+    """The recordings to train on, and how to read them."""
 
     recordings: Sequence[Location]
     layout: RigLayout | None
@@ -46,27 +46,29 @@ class Source:
 
 @dataclass
 class Prepared:
-    """What was found."""
+    """The recordings of a run, ready to be trained on."""
 
     indexes: list[RecordingIndex] = field(default_factory=list)
-    """Of the recordings that can be used, with masks."""
+    """The recordings that can be used, with masks in their rigs."""
     left_out: dict[str, str] = field(default_factory=dict)
-    """Why the others cannot."""
+    """By path: why the others cannot be used."""
     warnings: list[str] = field(default_factory=list)
+    """One line about each loss or doubtful finding."""
     found_masks: dict[str, Path] = field(default_factory=dict)
     """Masks of the vehicle's own body that were found, by a name for each."""
 
 
 def prepare(source: Source, run: Path) -> Prepared:
-    """Check and index the recordings; RecordingError, with every reason, when none can be used."""
+    """Return the recordings, checked, indexed and masked; RecordingError, with every reason, when none can be used."""
     prepared = Prepared()
     for path in source.recordings:
         try:
-            problems = [found for found in checked(path, source, run) if found.result.status in ("failed", "warning")]
+            checks = check_results(path, source, run)
+            problems = [found for found in checks if found.result.status in ("failed", "warning")]
             _refuse(path, problems)
             index = load_index(path, run / _INDEX_FOLDER, source.matching, source.layout)
             prepared.indexes.append(index)
-            prepared.warnings += [_told(path, problem) for problem in problems]
+            prepared.warnings += [_describe_finding(path, problem) for problem in problems]
             prepared.warnings += [f"{path}: {loss}" for loss in index.losses]
         except (CvcDepthError, OSError) as error:
             prepared.left_out[str(path)] = str(error)
@@ -77,7 +79,7 @@ def prepare(source: Source, run: Path) -> Prepared:
     return prepared
 
 
-def checked(path: Location, source: Source, run: Path) -> list[NumberedResult]:
+def check_results(path: Location, source: Source, run: Path) -> list[NumberedResult]:
     """Return the results of `cvcdepth check`, found now, or before in the very same recording and rig."""
     matching, layout = source.matching, source.layout
     options = CheckOptions(tolerance=matching.tolerance, queue_size=matching.queue_size, lidar=source.lidar)
@@ -109,10 +111,10 @@ def _checks_from_arrays(arrays: Arrays) -> list[NumberedResult]:
 def _refuse(path: Location, problems: Sequence[NumberedResult]) -> None:
     fatal = [found for found in problems if found.result.status == "failed" and found.name not in NOT_NEEDED]
     if fatal:
-        raise RecordingError("; ".join(_told(path, found) for found in fatal))
+        raise RecordingError("; ".join(_describe_finding(path, found) for found in fatal))
 
 
-def _told(path: Location, found: NumberedResult) -> str:
+def _describe_finding(path: Location, found: NumberedResult) -> str:
     remedy = f" -> {found.result.remedy}" if found.result.remedy else ""
     return f"{path}: check {found.number}, {found.name}: {found.result.finding}{remedy}"
 

@@ -17,7 +17,7 @@ from cvcdepth_ros.evaluation.image_scores import SetScore
 from cvcdepth_ros.evaluation.job import EvaluationJob
 from cvcdepth_ros.evaluation.result import EvaluationResult
 from cvcdepth_ros.finetuning.card import SCORE_TITLES
-from cvcdepth_ros.finetuning.run import START_FILE, FineTuned
+from cvcdepth_ros.finetuning.run import START_FILE, FinetuneResult
 from cvcdepth_ros.reports.evaluation_pictures import SetPictures
 from cvcdepth_ros.reports.learning_curves import RunLog, held_out_curves, loss_curves
 from cvcdepth_ros.reports.shown_sets import ShownSet, chosen_sets, drawn_again, shown_set
@@ -26,10 +26,10 @@ from cvcdepth_ros.reports.style import render_page, to_png
 _MASK_WIDTH = 480
 
 
-def write_report(path: Path, tuned: FineTuned, card: Mapping[str, Any]) -> None:
+def write_report(path: Path, result: FinetuneResult, card: Mapping[str, Any]) -> None:
     """Write the page."""
-    log = RunLog.read(tuned.order.run / LOG_FILE)
-    write_atomically(path, render(card, _shown_sets(tuned), log, _masks(tuned)).encode())
+    log = RunLog.read(result.job.run / LOG_FILE)
+    write_atomically(path, render(card, _shown_sets(result), log, _masks(result)).encode())
 
 
 def render(card: Mapping[str, Any], shown: Sequence[ShownSet], log: RunLog, masks: Mapping[str, bytes]) -> str:
@@ -46,14 +46,14 @@ def render(card: Mapping[str, Any], shown: Sequence[ShownSet], log: RunLog, mask
     return render_page("finetuning.html", content)
 
 
-def _shown_sets(tuned: FineTuned) -> list[ShownSet]:
+def _shown_sets(result: FinetuneResult) -> list[ShownSet]:
     """Return the sets that are best, median and worst afterwards, as the start and the new weights see them."""
-    before, after = tuned.before, tuned.after
+    before, after = result.before, result.after
     if before is None or after is None:
         return []
     earlier = {(found.recording, found.stamp_ns): found for found in before.sets}
-    jobs = {part.job.name: part.job for part in tuned.parts}
-    networks = (("before", tuned.order.run / START_FILE, before), ("after", tuned.weights, after))
+    jobs = {part.job.name: part.job for part in result.parts}
+    networks = (("before", result.job.run / START_FILE, before), ("after", result.weights, after))
     return [
         _shown(title, [earlier[score.recording, score.stamp_ns], score], jobs[score.recording], networks)
         for title, score in chosen_sets(after.sets)
@@ -78,10 +78,10 @@ def _drawn(title: str, job: EvaluationJob, weights: Path, result: EvaluationResu
     return drawn_again(title, score, result, replace(job, settings=settings))
 
 
-def _masks(tuned: FineTuned) -> dict[str, bytes]:
+def _masks(result: FinetuneResult) -> dict[str, bytes]:
     """Return the masks that were found, small."""
     found = {}
-    for name, path in tuned.prepared.found_masks.items():
+    for name, path in result.prepared.found_masks.items():
         mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         if mask is not None:
             height = round(_MASK_WIDTH * mask.shape[0] / mask.shape[1])
