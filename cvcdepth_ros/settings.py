@@ -18,13 +18,8 @@ if TYPE_CHECKING:
     from cvcdepth_core.pointcloud import CloudLimits
 
 
-SET_TOLERANCE = 0.1
-"""Seconds that two images of one set may be apart, where nothing else is asked for."""
-QUEUE_SIZE = 10
-"""Images that are kept per camera while their set is not complete, where nothing else is asked for."""
-
-_UNTRAINED_DEPTHS = (1.5, 200.0)  # metres: least and greatest depth of a network with random weights
 _SMALLEST_VOXEL = 0.01
+_UNTRAINED_DEPTHS = (1.5, 200.0)  # metres: least and greatest depth of a network with random weights
 
 
 class Settings(BaseModel):
@@ -92,9 +87,9 @@ class ModelSettings(Settings):
 class MatchingSettings(Settings):
     """Which images make a surround set."""
 
-    tolerance: float = Field(default=SET_TOLERANCE, gt=0, le=10)
+    tolerance: float = Field(default=0.1, gt=0, le=10)
     """Seconds that two images of one set may be apart."""
-    queue_size: int = Field(default=QUEUE_SIZE, ge=2, le=1000)
+    queue_size: int = Field(default=10, ge=2, le=1000)
     """Images that are kept per camera while their set is not complete."""
 
 

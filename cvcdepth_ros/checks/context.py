@@ -21,7 +21,6 @@ from cvcdepth_ros.messages.rig_assembly import RigAssembler
 from cvcdepth_ros.recordings.lidar import VehicleMotion, find_lidars
 from cvcdepth_ros.recordings.rig import IMAGE_TYPES, collect_rig, discover_layout
 from cvcdepth_ros.recordings.topic_timing import TopicTiming
-from cvcdepth_ros.settings import QUEUE_SIZE, SET_TOLERANCE
 from cvcdepth_ros.surround_sets.synchronizer import SurroundSet, SurroundSynchronizer
 
 Status = Literal["passed", "warning", "failed", "skipped"]
@@ -48,9 +47,9 @@ class CheckResult:
 class CheckOptions:
     """What the recording is to be good for."""
 
-    tolerance: float = SET_TOLERANCE
+    tolerance: float = 0.1
     """Seconds that two images of one set may be apart."""
-    queue_size: int = QUEUE_SIZE
+    queue_size: int = 10
     """Images that are kept per camera while their set is not complete."""
     base_frame: str = "base_link"
     """The vehicle's frame where no rig file names it."""

@@ -29,11 +29,12 @@ from cvcdepth_ros.end_to_end.paths import DemoPaths
 from cvcdepth_ros.end_to_end.processes import children
 from cvcdepth_ros.end_to_end.received import Output, ReceivedSets, node_outputs, sent_sets
 from cvcdepth_ros.installation import package_version
-from cvcdepth_ros.settings import SET_TOLERANCE, ModelSettings
+from cvcdepth_ros.settings import MatchingSettings, ModelSettings
 
 SAMPLE = Path(__file__).parents[2] / "samples" / "pandaset_002_excerpt"
 NODE = "/surround_depth"
 
+_TOLERANCE_SECONDS = MatchingSettings().tolerance
 _SAMPLE_CREDIT = "Recording: PandaSet by Hesai and Scale AI, CC BY 4.0"
 _EXAMPLE = """example:
   python -m cvcdepth_ros.demo --output output/demo
@@ -97,7 +98,7 @@ class Setup:
         parameters = {
             "use_sim_time": True,
             "rig": str(paths.rig.absolute()),
-            "tolerance": SET_TOLERANCE,
+            "tolerance": _TOLERANCE_SECONDS,
             **model.model_dump(exclude_defaults=True),
         }
         outputs = node_outputs(NODE, layout.names, layout.anchor_camera)
@@ -135,7 +136,7 @@ def _model(options: argparse.Namespace) -> ModelSettings:
 def _show(setup: Setup, paths: DemoPaths, outcome: LiveOutcome) -> DemoResult:
     """Write pictures, result and page of what arrived; return the result."""
     with open_recording(setup.recording) as recording:
-        sets = sent_sets(recording, setup.layout, SET_TOLERANCE, outcome.sent)
+        sets = sent_sets(recording, setup.layout, _TOLERANCE_SECONDS, outcome.sent)
         received = ReceivedSets(paths.recording, setup.outputs, sets)
         lidar = RecordedLidar(recording, setup.layout)
         writer = SheetWriter(setup.layout.complete(), lidar, paths.sheets, setup.notes(outcome), setup.model.untrained)

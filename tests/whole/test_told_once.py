@@ -14,14 +14,7 @@ from cvcdepth_ros.bag_replay import build_parser
 from cvcdepth_ros.checks import CHECKS, CheckOptions
 from cvcdepth_ros.commands import check
 from cvcdepth_ros.evaluation.job import EvaluationSettings
-from cvcdepth_ros.settings import (
-    QUEUE_SIZE,
-    SET_TOLERANCE,
-    MatchingSettings,
-    MissingCameraSettings,
-    ModelSettings,
-    OutputSettings,
-)
+from cvcdepth_ros.settings import MatchingSettings, MissingCameraSettings, ModelSettings, OutputSettings
 
 NUMBERS = dict(enumerate(["ten", "eleven", "twelve", "thirteen", "fourteen", "fifteen"], 10))
 PARAMETERS = ROOT / "config" / "surround_depth.yaml"
@@ -42,10 +35,9 @@ def choices(field: str) -> tuple[str, ...]:
 
 
 def test_images_of_one_set_are_as_far_apart_for_training_and_checks_as_for_the_node():
-    defaults = MatchingSettings()
-    assert (defaults.tolerance, defaults.queue_size) == (SET_TOLERANCE, QUEUE_SIZE)
-    assert RecordingsConfig().tolerance == SET_TOLERANCE
-    assert (CheckOptions().tolerance, CheckOptions().queue_size) == (SET_TOLERANCE, QUEUE_SIZE)
+    defaults, checks = MatchingSettings(), CheckOptions()
+    assert RecordingsConfig().tolerance == defaults.tolerance
+    assert (checks.tolerance, checks.queue_size) == (defaults.tolerance, defaults.queue_size)
 
 
 def test_the_parameter_file_has_the_defaults_of_the_settings():
