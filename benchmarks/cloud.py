@@ -23,7 +23,7 @@ from cvcdepth_core.pointcloud import CloudLimits, merged_cloud
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.surround_depth import SurroundDepth
 from cvcdepth_ros.bags import open_recording
-from cvcdepth_ros.bench.straightforward import straightforward_cloud
+from cvcdepth_ros.bench.baseline_cloud import baseline_cloud
 from cvcdepth_ros.live.process_setup import prepare_process
 from cvcdepth_ros.recordings.rig import discover_rig
 
@@ -50,7 +50,7 @@ def main() -> None:
 def cases(surround: SurroundDepth, rig: Rig) -> dict[str, Callable[[], object]]:
     everything, near = CloudLimits(), CloudLimits(1, 0.5, 80.0)
     return {
-        "straightforward": lambda: array.array("B", straightforward_cloud(surround, rig, everything).tobytes()),
+        "straightforward": lambda: array.array("B", baseline_cloud(surround, rig, everything).tobytes()),
         "all points": lambda: field(merged_cloud(surround, rig, everything)),
         "0.5 to 80 m": lambda: field(merged_cloud(surround, rig, near)),
         "0.5 to 80 m, stride 2": lambda: field(merged_cloud(surround, rig, CloudLimits(2, 0.5, 80.0))),

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole node: recording -> topics -> node -> subscriber over DDS, against the straightforward node.
+"""The whole node: recording -> topics -> node -> subscriber over DDS, against the baseline node.
 
     .venv/bin/python benchmarks/node.py [--height 192 --width 320] [--seconds 20] [--rate 2]
 
-What `bag_replay bench` measures on the sample, as two lines in the form of the other benchmarks. Needs rclpy.
+What `cvcdepth bench` measures on the sample, as two lines in the form of the other benchmarks. Needs rclpy.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 
 from measuring import circumstances, print_line
 
-from cvcdepth_ros.bag_replay import main as bag_replay
+from cvcdepth_ros.bag_replay import main as cvcdepth
 
 SAMPLE = Path(__file__).parent.parent / "samples" / "pandaset_002_excerpt"
 _SHARED = ("median_ms", "p95_ms", "per_second", "outside_inference", "peak_memory_mb")
@@ -56,7 +56,7 @@ def measured(options: argparse.Namespace) -> dict[str, Any]:
     played = ["--width", str(options.width), "--seconds", str(options.seconds), "--rate", str(options.rate)]
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):
-        code = bag_replay(["bench", str(SAMPLE), *network, *played])
+        code = cvcdepth(["bench", str(SAMPLE), *network, *played])
     if code:
         raise SystemExit(code)
     result: dict[str, Any] = json.loads(printed.getvalue().splitlines()[-1])

@@ -20,12 +20,12 @@ from cvcdepth_core.rig.rig import Camera, Rig, order_around_vehicle
 Colour = tuple[int, int, int]
 Points = NDArray[np.floating]
 
-_BACKGROUND: Colour = (18, 20, 24)
-_PANEL: Colour = (28, 31, 37)
-_TEXT: Colour = (235, 238, 242)
-_QUIET_TEXT: Colour = (150, 158, 170)
-_WARNING: Colour = (255, 196, 64)
-_GRID: Colour = (62, 68, 78)
+BACKGROUND: Colour = (18, 20, 24)
+PANEL: Colour = (28, 31, 37)
+TEXT: Colour = (235, 238, 242)
+QUIET_TEXT: Colour = (150, 158, 170)
+WARNING: Colour = (255, 196, 64)
+GRID: Colour = (62, 68, 78)
 _AXIS: Colour = (104, 112, 126)
 _LIDAR: Colour = (0, 235, 255)
 _VEHICLE: Colour = (245, 245, 245)
@@ -122,10 +122,10 @@ def contact_sheet(rig: Rig, shown: SurroundPictures, scale: DepthScale | None = 
     scale = scale or DepthScale()
     tiles = _camera_tiles(rig, shown, scale)
     legend = _legend(scale, tiles.shape[1])
-    left = np.concatenate([tiles, _filled(_GAP, tiles.shape[1], _BACKGROUND), legend])
+    left = np.concatenate([tiles, _filled(_GAP, tiles.shape[1], BACKGROUND), legend])
     view = TopDownView(_SHEET_WIDTH - 3 * _MARGIN - left.shape[1], left.shape[0], _PIXELS_PER_METRE, _VIEW_CENTRE)
     header, footer = _header(shown), _footer(shown)
-    sheet = _filled(header.shape[0] + left.shape[0] + footer.shape[0], _SHEET_WIDTH, _BACKGROUND)
+    sheet = _filled(header.shape[0] + left.shape[0] + footer.shape[0], _SHEET_WIDTH, BACKGROUND)
     _paste(sheet, header, 0, 0)
     _paste(sheet, left, header.shape[0], _MARGIN)
     _paste(sheet, top_down(rig, shown.cloud, shown.lidar, view), header.shape[0], left.shape[1] + 2 * _MARGIN)
@@ -135,7 +135,7 @@ def contact_sheet(rig: Rig, shown: SurroundPictures, scale: DepthScale | None = 
 
 def top_down(rig: Rig, cloud: ColouredPoints, lidar: Points | None, view: TopDownView) -> Picture:
     """Draw the scene from above: grid, cloud in its own colours, LiDAR over it, the vehicle with its cameras."""
-    picture = _filled(view.height, view.width, _PANEL)
+    picture = _filled(view.height, view.width, PANEL)
     _draw_grid(picture, view)
     _plot(picture, view, cloud.xyz, _brightened(cloud.rgb), size=3)
     if lidar is not None:
@@ -170,7 +170,7 @@ def _camera_tiles(rig: Rig, shown: SurroundPictures, scale: DepthScale) -> Pictu
     rows = viewing_rows(rig)
     width = (_TILES_WIDTH - _GAP * (len(rows[0]) - 1)) // len(rows[0])
     height = round(width * shown.depth.shape[1] / shown.depth.shape[2])
-    tiles = _filled(4 * height + 4 * _GAP, _TILES_WIDTH, _BACKGROUND)
+    tiles = _filled(4 * height + 4 * _GAP, _TILES_WIDTH, BACKGROUND)
     for i, names in enumerate(rows):
         top = i * (2 * height + 3 * _GAP)
         for j, name in enumerate(names):
@@ -184,30 +184,30 @@ def _camera_tiles(rig: Rig, shown: SurroundPictures, scale: DepthScale) -> Pictu
 
 def _legend(scale: DepthScale, width: int) -> Picture:
     """Draw the colour bar over its ticks in metres."""
-    legend = _filled(72, width, _BACKGROUND)
+    legend = _filled(72, width, BACKGROUND)
     bar_left, bar_right, top, bottom = 340, width - 180, 12, 34
     span = np.linspace(0.0, 1.0, bar_right - bar_left)
     depths = scale.near * (scale.far / scale.near) ** span
     legend[top:bottom, bar_left:bar_right] = scale.colours(depths.astype(np.float32))
     for tick in scale.ticks():
         column = bar_left + round((bar_right - bar_left - 1) * math.log(tick / scale.near, scale.far / scale.near))
-        cv2.line(legend, (column, bottom), (column, bottom + 6), _QUIET_TEXT, 1)
+        cv2.line(legend, (column, bottom), (column, bottom + 6), QUIET_TEXT, 1)
         _write(legend, f"{tick:g} m", (column, bottom + 28), centred=True)
-    _write(legend, "depth along each camera's axis", (0, bottom - 4), colour=_TEXT)
+    _write(legend, "depth along each camera's axis", (0, bottom - 4), colour=TEXT)
     _write(legend, "black: unknown", (bar_right + 24, bottom - 4))
     return legend
 
 
 def _header(shown: SurroundPictures) -> Picture:
-    header = _filled(64, _SHEET_WIDTH, _BACKGROUND)
-    _write(header, shown.title, (_MARGIN, 43), size=1.0, colour=_TEXT)
+    header = _filled(64, _SHEET_WIDTH, BACKGROUND)
+    _write(header, shown.title, (_MARGIN, 43), size=1.0, colour=TEXT)
     if shown.warning:
-        _write(header, shown.warning, (_SHEET_WIDTH - _MARGIN, 42), size=0.9, colour=_WARNING, right=True)
+        _write(header, shown.warning, (_SHEET_WIDTH - _MARGIN, 42), size=0.9, colour=WARNING, right=True)
     return header
 
 
 def _footer(shown: SurroundPictures) -> Picture:
-    footer = _filled(14 + 30 * len(shown.captions), _SHEET_WIDTH, _BACKGROUND)
+    footer = _filled(14 + 30 * len(shown.captions), _SHEET_WIDTH, BACKGROUND)
     for i, caption in enumerate(shown.captions):
         _write(footer, caption, (_MARGIN, 28 + 30 * i))
     return footer
@@ -217,10 +217,10 @@ def _draw_grid(picture: Picture, view: TopDownView) -> None:
     xs, ys = view.grid_lines()
     for x in xs:
         row = round(float(view.pixels(np.array([x, 0.0]))[1]))
-        cv2.line(picture, (0, row), (view.width, row), _AXIS if x == 0 else _GRID, 1)
+        cv2.line(picture, (0, row), (view.width, row), _AXIS if x == 0 else GRID, 1)
     for y in ys:
         column = round(float(view.pixels(np.array([0.0, y]))[0]))
-        cv2.line(picture, (column, 0), (column, view.height), _AXIS if y == 0 else _GRID, 1)
+        cv2.line(picture, (column, 0), (column, view.height), _AXIS if y == 0 else GRID, 1)
 
 
 def _draw_grid_labels(picture: Picture, view: TopDownView) -> None:
@@ -245,7 +245,7 @@ def _draw_vehicle(picture: Picture, view: TopDownView, rig: Rig) -> None:
     corners = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)]) * (half_length, half_width) + (x, y)
     front = np.array([(1.0, 0.0), (0.45, 0.7), (0.45, -0.7)]) * (half_length, half_width) + (x, y)
     outline, mark = (np.rint(view.pixels(shape)).astype(np.int32) for shape in (corners, front))
-    cv2.fillPoly(picture, [outline], _BACKGROUND, cv2.LINE_AA)
+    cv2.fillPoly(picture, [outline], BACKGROUND, cv2.LINE_AA)
     cv2.polylines(picture, [outline], True, _VEHICLE, 2, cv2.LINE_AA)
     cv2.fillPoly(picture, [mark], _VEHICLE, cv2.LINE_AA)
 
@@ -304,7 +304,7 @@ def _label(tile: Picture, name: str) -> None:
     """Write a camera's name into the picture's corner, on a dark ground."""
     width = _text_width(name, 0.75)
     tile[:34, : width + 20] = tile[:34, : width + 20] // 4
-    _write(tile, name, (10, 25), size=0.75, colour=_TEXT)
+    _write(tile, name, (10, 25), size=0.75, colour=TEXT)
 
 
 def _write(
@@ -313,7 +313,7 @@ def _write(
     origin: tuple[int, int],
     *,
     size: float = 0.75,
-    colour: Colour = _QUIET_TEXT,
+    colour: Colour = QUIET_TEXT,
     centred: bool = False,
     right: bool = False,
     outlined: bool = False,
@@ -324,8 +324,8 @@ def _write(
     if outlined:
         for shift in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
             shadow = (at[0] + shift[0], at[1] + shift[1])
-            cv2.putText(picture, text, shadow, cv2.FONT_HERSHEY_SIMPLEX, size, _BACKGROUND, 1, cv2.LINE_AA)
-        colour = _TEXT
+            cv2.putText(picture, text, shadow, cv2.FONT_HERSHEY_SIMPLEX, size, BACKGROUND, 1, cv2.LINE_AA)
+        colour = TEXT
     cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
 
 

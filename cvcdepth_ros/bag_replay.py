@@ -10,11 +10,14 @@ from typing import Any, Protocol
 
 from cvcdepth_core.errors import CvcDepthError, NotPromotedError
 from cvcdepth_ros.commands import bench, check, evaluate, export, finetune, inspect, play, rig, run
-from cvcdepth_ros.version import package_version
+from cvcdepth_ros.installation import package_version
+
+PROGRAM = "cvcdepth"
+"""The program's name in examples, messages and results. ROS users know it as `bag_replay` too."""
 
 
 class Command(Protocol):
-    """What each module of `cvcdepth_ros.commands` offers."""
+    """The interface of each module of `cvcdepth_ros.commands`."""
 
     SUMMARY: str
     """One line for the list of commands; what may follow is for the command's own help."""
@@ -46,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Wrong use ends by SystemExit(2).
     """
-    program = "cvcdepth" if Path(sys.argv[0]).name == "cvcdepth" else "bag_replay"
+    program = "bag_replay" if Path(sys.argv[0]).name == "bag_replay" else PROGRAM
     try:
         parsed = build_parser(program).parse_args(arguments)
         parsed.execute(parsed)
@@ -65,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def build_parser(program: str) -> argparse.ArgumentParser:
-    """Build the parser of all commands; `program` is what the help calls it."""
+    """Return the parser of all commands; `program` is the name that its usage shows."""
     parser = argparse.ArgumentParser(**_texts(program, str(__doc__), [f"{name} --help" for name in COMMANDS]))
     parser.add_argument("--version", action="version", version=f"%(prog)s {package_version()}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
@@ -80,7 +83,7 @@ def build_parser(program: str) -> argparse.ArgumentParser:
 
 
 def _texts(program: str, description: str, examples: Sequence[str]) -> dict[str, Any]:
-    lines = "".join(f"\n  {program.split()[0]} {example}" for example in examples)
+    lines = "".join(f"\n  {PROGRAM} {example}" for example in examples)
     return {
         "prog": program,
         "description": description,

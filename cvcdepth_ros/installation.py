@@ -1,15 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the files that are not Python lie: configuration, rigs, launch files."""
+"""The installation that is running: its version, and where its configuration, rigs and launch files lie."""
 
 from pathlib import Path
+from xml.etree import ElementTree
 
 from cvcdepth_core.errors import ConfigError
 
 PACKAGE = "cvcdepth_ros"
 
 
+def package_version() -> str:
+    """Return the version that package.xml states; ConfigError when the package's files are not installed."""
+    return ElementTree.parse(share_directory() / "package.xml").findtext("version", default="unknown")
+
+
 def share_directory() -> Path:
-    """Find the folder that holds `config/` and `launch/`, for the very installation that is running.
+    """Return the folder that holds `config/` and `launch/` of the very installation that is running.
 
     It is looked for upwards from this file, so that no environment variable can lead to another version's files: the
     source tree (an editable installation) holds `package.xml` and `config`; colcon and pip put them into

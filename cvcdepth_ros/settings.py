@@ -21,10 +21,11 @@ LIDAR_TOLERANCE = 0.1
 """Seconds that a LiDAR sweep may be from the image that it is the truth of, unless something else is asked for."""
 
 _SMALLEST_VOXEL = 0.01
+_UNTRAINED_DEPTHS = (1.5, 200.0)  # metres: least and greatest depth of a network with random weights
 
 
 class Settings(BaseModel):
-    """Frozen, and nothing may be misspelt."""
+    """Base of all settings: immutable; unknown fields are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
@@ -60,13 +61,13 @@ class ModelSettings(Settings):
 
     @property
     def notice(self) -> str:
-        """What must be said of the network's depth; nothing about a checkpoint of the user's own."""
+        """A warning about what the network's depth is worth; empty for a checkpoint of the user's own."""
         if self.untrained:
             return "untrained: the network has random weights, and its depth means nothing"
         return NOTICE if self.checkpoint in ("", DEFAULT) else ""
 
     def build_estimator(self) -> "DepthEstimator":
-        """Load the checkpoint, or make the untrained network; CheckpointError or ConfigError says what is wrong."""
+        """Return the checkpoint's network, or an untrained one; CheckpointError or ConfigError says what is wrong."""
         from cvcdepth_core.estimator import DepthEstimator
         from cvcdepth_core.networks.checkpoint import check_sha256
         from cvcdepth_core.networks.registry import DepthModelSpec
@@ -77,8 +78,9 @@ class ModelSettings(Settings):
             check_sha256(path, self.checkpoint_sha256)
             return DepthEstimator.from_checkpoint(path, self.device, **engine)
         try:
+            least, greatest = _UNTRAINED_DEPTHS
             spec = DepthModelSpec(
-                encoder=self.encoder, height=self.height, width=self.width, min_depth=1.5, max_depth=200.0
+                encoder=self.encoder, height=self.height, width=self.width, min_depth=least, max_depth=greatest
             )
         except ValidationError as error:
             raise ConfigError(f"parameter {first_validation_message(error)}") from error
@@ -95,14 +97,14 @@ class MatchingSettings(Settings):
 
 
 class MissingCameraSettings(Settings):
-    """What becomes of sets when cameras fail."""
+    """How many cameras a set needs."""
 
     min_cameras: int = Field(0, ge=0, le=64)
     """Cameras without which no set is made: with fewer than all, dead cameras are left out; 0 holds such sets back."""
 
 
 class OutputSettings(Settings):
-    """What the depth images and clouds are like."""
+    """Encoding of the depth images and limits of the merged cloud."""
 
     depth_encoding: Literal["32FC1", "16UC1"] = "32FC1"
     """Encoding of depth images: 32FC1 metres with NaN for unknown, or 16UC1 millimetres with 0 (REP 118)."""
@@ -124,7 +126,7 @@ class OutputSettings(Settings):
 
     @property
     def cloud_limits(self) -> "CloudLimits":
-        """The merged cloud's limits."""
+        """Which points the merged cloud keeps."""
         from cvcdepth_core.pointcloud import CloudLimits
 
         return CloudLimits(self.cloud_stride, self.cloud_min_range, self.cloud_max_range, self.cloud_voxel)

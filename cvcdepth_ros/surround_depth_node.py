@@ -36,7 +36,7 @@ from cvcdepth_ros.node.session import SurroundSession
 
 _POLL_SECONDS = 0.25
 _DIAGNOSTICS_SECONDS = 1.0
-_FINE = CameraCondition(CameraState.OK)
+_HEALTHY = CameraCondition(CameraState.OK)
 
 _HELP = """example:
   surround_depth_node --ros-args -p rig:=rig.yaml -p checkpoint:=model.safetensors
@@ -173,10 +173,10 @@ class SurroundDepthNode(ManagedNode):
     def _report(self, conditions: dict[str, CameraCondition]) -> None:
         """Log what is wrong with each camera once, when it begins, and its end."""
         for camera, condition in conditions.items():
-            former = self._reported.get(camera, _FINE)
+            former = self._reported.get(camera, _HEALTHY)
             if condition == former:
                 continue
-            if condition == _FINE:  # rclpy wants every line of code to log with one severity
+            if condition == _HEALTHY:  # rclpy wants every line of code to log with one severity
                 self.get_logger().info(f"camera {camera}: ok")
             elif condition.state != former.state:
                 self.get_logger().warning(f"camera {camera}: {condition.text}")

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `bag_replay bench` and the benchmarks measure against and with."""
+"""The baselines that `cvcdepth bench` and the benchmarks measure against."""

@@ -75,6 +75,6 @@ def _judge(best: Exchange, rig: Rig) -> CheckResult:
     values = {"cameras": names, "error": round(error, 4), "exchanged_error": round(exchanged, 4)}
     numbers = f"photometric error to the neighbours {error:.3f}, exchanged {exchanged:.3f}"
     if float(np.median(best.ratio)) < _MUCH_BETTER and bool((best.ratio < 1).all()):
-        remedy = f"compare topics, frames and transforms of {both}; `bag_replay rig` shows where they look"
+        remedy = f"compare topics, frames and transforms of {both}; `cvcdepth rig` shows where they look"
         return CheckResult("failed", f"{both} seem to be swapped: {numbers}", remedy, values)
     return CheckResult("passed", f"no two cameras fit better when exchanged; {both}: {numbers}", values=values)

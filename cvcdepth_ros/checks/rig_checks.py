@@ -28,7 +28,7 @@ def check_cameras(context: CheckContext) -> CheckResult:
     if context.has_rig_file and context.assembler is not None:
         layout = context.assembler.layout
         problems = [*topic_problems(recording, layout)]
-        remedy = "correct the topics in the rig file; `bag_replay inspect` lists those recorded"
+        remedy = "correct the topics in the rig file; `cvcdepth inspect` lists those recorded"
         return _judged(problems, remedy, f"{len(layout.names)} of the rig file: {', '.join(layout.names)}")
     names = [camera.name for camera in recorded_cameras(recording)]
     found = f"{len(names)} found: {', '.join(names)}" if names else "none found"

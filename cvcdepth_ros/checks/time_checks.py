@@ -101,7 +101,7 @@ def _limit(
     if len(wide) > sets:
         return _limit_by_spread(context, layout, wide)
     fewest = min(received, key=received.__getitem__)
-    remedy = "look for lost images (`bag_replay inspect` shows gaps); choose the slowest camera as anchor in a rig file"
+    remedy = "look for lost images (`cvcdepth inspect` shows gaps); choose the slowest camera as anchor in a rig file"
     return f"limited by {fewest} with {received[fewest]} images", remedy, {"limited_by": [fewest]}
 
 

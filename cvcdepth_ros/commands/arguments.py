@@ -1,19 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options and output that several commands have in common."""
+"""Options that several commands have in common, and what their values mean."""
 
 import argparse
-import json
-import math
-import sys
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin
 
 from pydantic import ValidationError
 
 from cvcdepth_core.errors import ConfigError, first_validation_message
+from cvcdepth_ros.console import non_negative, positive, progress_bar
 from cvcdepth_ros.settings import ModelSettings
 
 if TYPE_CHECKING:
@@ -132,71 +129,15 @@ def window_ns(arguments: argparse.Namespace, recording_start: int) -> tuple[int,
     return start, None if arguments.duration is None else start + round(arguments.duration * 1e9)
 
 
-def print_result(result: dict[str, Any], text: str, as_json: bool) -> None:
-    """Print the result on stdout, for machines or for people."""
-    print(json.dumps(result, indent=2) if as_json else text)
-
-
-def warn(text: str) -> None:
-    """Tell something on stderr that does not end the command."""
-    print(f"warning: {text}", file=sys.stderr)
-
-
-def can_draw(page: str) -> bool:
-    """Say whether a page can be made, and warn where it cannot; to be asked before the work begins."""
-    missing = [name for name in ("jinja2", "matplotlib") if find_spec(name) is None]
-    if missing:
-        warn(f"no {page}: {' and '.join(missing)} not installed; pip install 'cvcdepth_ros[report]' brings it")
-    return not missing
-
-
 @contextmanager
 def recording_progress(
     recording: "Recording", window: tuple[int, int | None], quiet: bool
 ) -> Iterator[Callable[[int], None]]:
-    """Show on a terminal how much of the window is read; what is given is to be called with log times (ns)."""
-    from tqdm import tqdm
-
+    """Show on a terminal how much of the window is read; give a function to be called with the log times (ns) read."""
     start, stop = window[0], min(window[1] or recording.end, recording.end)
-    form = "{percentage:3.0f}%|{bar}| {n:.1f} of {total:.1f} s recorded [{elapsed}<{remaining}]"
-    with tqdm(total=(stop - start) / 1e9, disable=True if quiet else None, bar_format=form, leave=False) as bar:
-
-        def show(log_time: int) -> None:
-            bar.update((log_time - start) / 1e9 - bar.n)
-
-        yield show
-
-
-def table(header: Sequence[str], rows: Sequence[Sequence[str]], numbers: Collection[int] = ()) -> str:
-    """Lay out columns as wide as their widest cell; those of `numbers` (from 0) are aligned at the right."""
-    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
-    lines = (
-        "  ".join(
-            cell.rjust(width) if column in numbers else cell.ljust(width)
-            for column, (cell, width) in enumerate(zip(row, widths, strict=True))
-        )
-        for row in (header, *rows)
-    )
-    return "\n".join(line.rstrip() for line in lines)
-
-
-def positive(text: str) -> float:
-    """Parse a number above zero."""
-    number = non_negative(text)
-    if number == 0:
-        raise argparse.ArgumentTypeError("must be above 0")
-    return number
-
-
-def non_negative(text: str) -> float:
-    """Parse a number of at least zero."""
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not 0 <= number < math.inf:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a number of at least 0")
-    return number
+    seconds = (stop - start) / 1e9
+    with progress_bar(seconds, "s recorded", quiet=quiet, is_kept=False) as show:
+        yield lambda log_time: show((log_time - start) / 1e9)
 
 
 def _value_of(annotation: Any) -> dict[str, Any]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`bench`: measure the live node on a recording, over DDS, against the straightforward node."""
+"""`bench`: measure the live node on a recording, over DDS, against the baseline node."""
 
 import argparse
 import json
@@ -10,16 +10,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cvcdepth_core.errors import RecordingError
-from cvcdepth_ros.commands.arguments import add_recording, add_settings, positive, settings_from
+from cvcdepth_ros.commands.arguments import add_recording, add_settings, settings_from
+from cvcdepth_ros.console import positive
+from cvcdepth_ros.installation import package_version
 from cvcdepth_ros.settings import ModelSettings
-from cvcdepth_ros.version import package_version
 
 if TYPE_CHECKING:
     from cvcdepth_core.rig.rig_file import RigLayout
     from cvcdepth_ros.end_to_end.live_run import LiveOutcome
     from cvcdepth_ros.end_to_end.paths import DemoPaths
 
-SUMMARY = """Measure the live node on a recording, over DDS, against the straightforward node.
+SUMMARY = """Measure the live node on a recording, over DDS, against the baseline node.
 
 Player, node and subscriber are processes of their own. The baseline is measured in the same run: a node that decodes,
 estimates (PyTorch, operation by operation) and publishes one set after the other. Prints one line of JSON. A rate at
@@ -30,7 +31,7 @@ EXAMPLES: tuple[str, ...] = (
 )
 
 _NODE = "/surround_depth"
-_NODES = {"straightforward": "cvcdepth_ros.bench.straightforward_node", "node": "cvcdepth_ros.surround_depth_node"}
+_NODES = {"baseline": "cvcdepth_ros.bench.baseline_node", "node": "cvcdepth_ros.surround_depth_node"}
 _CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 
 
@@ -40,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_settings(parser, ModelSettings)
     parser.add_argument("--seconds", type=positive, default=10.0, metavar="S", help="recorded seconds to play [10]")
     parser.add_argument("--rate", type=positive, default=1.0, metavar="R", help="how many times real time [1]")
-    parser.add_argument("--no-baseline", action="store_true", help="leave the straightforward node out")
+    parser.add_argument("--no-baseline", action="store_true", help="leave the baseline node out")
 
 
 def execute(arguments: argparse.Namespace) -> None:
@@ -72,7 +73,7 @@ def _measure(
     paths = DemoPaths(folder / name)
     paths.prepare()
     save_rig_layout(paths.rig, layout)
-    backend = {"backend": "torch_eager"} if name == "straightforward" else {}
+    backend = {"backend": "torch_eager"} if name == "baseline" else {}
     _write_parameters(paths, model.model_copy(update=backend))
     outputs = node_outputs(_NODE, layout.names, layout.anchor_camera)
     info = next(c.camera_info_topic for c in layout.cameras if c.name == layout.anchor_camera)
@@ -92,7 +93,7 @@ def _write_parameters(paths: "DemoPaths", model: ModelSettings) -> None:
 
 
 def _figures(paths: "DemoPaths", anchor: str, info: str, outcome: "LiveOutcome") -> dict[str, Any]:
-    """Say how often depth came, how old it was, and where the time went.
+    """Return the intervals between sets, the age of depth, and the latency of each stage, in milliseconds.
 
     Ages are those of the anchor's depth: from its camera_info's arrival at the subscriber to its own.
     """
@@ -139,7 +140,7 @@ def _result(arguments: argparse.Namespace, model: ModelSettings, found: dict[str
     import numpy
     import torch
 
-    ratio = found["straightforward"]["median_ms"] / found["node"]["median_ms"] if "straightforward" in found else None
+    ratio = found["baseline"]["median_ms"] / found["node"]["median_ms"] if "baseline" in found else None
     return {
         "benchmark": "bench",
         "version": package_version(),
@@ -149,6 +150,6 @@ def _result(arguments: argparse.Namespace, model: ModelSettings, found: dict[str
         "rate": arguments.rate,
         "model": model.model_dump(exclude_defaults=True),
         **found["node"],
-        "baseline": found.get("straightforward"),
+        "baseline": found.get("baseline"),
         "times_baseline": None if ratio is None else round(ratio, 2),
     }

@@ -18,12 +18,11 @@ from cvcdepth_ros.commands.arguments import (
     add_skip,
     add_window,
     lidar_topics,
-    positive,
-    print_result,
     recording_progress,
     refuse_unknown_checks,
     window_ns,
 )
+from cvcdepth_ros.console import positive, print_result
 from cvcdepth_ros.settings import MatchingSettings
 
 if TYPE_CHECKING:

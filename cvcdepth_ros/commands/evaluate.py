@@ -3,8 +3,8 @@
 
 import argparse
 import json
-from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,18 +17,16 @@ from cvcdepth_ros.commands.arguments import (
     add_recordings,
     add_settings,
     add_window,
-    can_draw,
     lidar_topics,
-    print_result,
     settings_from,
-    table,
-    warn,
 )
+from cvcdepth_ros.console import print_result, progress_bar, table, warn
 from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings, unique_names
+from cvcdepth_ros.reports import REPORT_FILE, can_draw_report
 
 if TYPE_CHECKING:
     from cvcdepth_core.scoring.scores import Score
-    from cvcdepth_ros.evaluation.measuring import Progress, RecordingScores
+    from cvcdepth_ros.evaluation.measuring import RecordingScores
     from cvcdepth_ros.evaluation.result import EvaluationResult
     from cvcdepth_ros.evaluation.workers import Pool
 
@@ -45,7 +43,6 @@ EXAMPLES: tuple[str, ...] = (
 )
 
 _METRICS_FILE, _FRAMES_FILE, _COMPARISON_FILE = "metrics.json", "per_frame.csv", "comparison.json"
-_REPORT_FILE = "report.html"
 _PARTS = "parts"
 
 
@@ -75,7 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--ray", action="store_true", help="hand the recordings to Ray, on a cluster started here")
     parser.add_argument("--ray-address", metavar="ADDRESS", help="... on the cluster there, as many as its CPUs take")
-    parser.add_argument("--no-report", action="store_true", help=f"numbers only, no {_REPORT_FILE}")
+    parser.add_argument("--no-report", action="store_true", help=f"numbers only, no {REPORT_FILE}")
     add_quiet(parser)
     add_json(parser)
 
@@ -132,7 +129,7 @@ def _evaluated(
 
     if settings.notice:
         warn(settings.notice)
-    with_report = not arguments.no_report and can_draw(_REPORT_FILE)
+    with_report = not arguments.no_report and can_draw_report()
     jobs = _jobs(arguments, settings)
     result = _result(arguments, settings, jobs, folder)
     content = result.to_json()
@@ -142,7 +139,7 @@ def _evaluated(
     if with_report:
         from cvcdepth_ros.reports.evaluation_page import write_report
 
-        write_report(folder / _REPORT_FILE, result, {job.name: job for job in jobs})
+        write_report(folder / REPORT_FILE, result, {job.name: job for job in jobs})
     return folder, {name: value for name, value in content.items() if name != "rows"}, _text(result, folder)
 
 
@@ -150,12 +147,12 @@ def _result(
     arguments: argparse.Namespace, settings: EvaluationSettings, jobs: Sequence[EvaluationJob], folder: Path
 ) -> "EvaluationResult":
     from cvcdepth_ros.evaluation.result import EvaluationResult, Failure
-    from cvcdepth_ros.evaluation.workers import KeptParts, evaluate_all
+    from cvcdepth_ros.evaluation.workers import KeptScores, evaluate_all
 
     depends_on = settings.dependencies()
-    kept = KeptParts(folder / _PARTS, depends_on)
+    kept = KeptScores(folder / _PARTS, depends_on)
     outcomes = []
-    with _pool(arguments, settings) as pool, _progress(len(jobs), arguments.quiet) as progress:
+    with _pool(arguments, settings) as pool, progress_bar(len(jobs), "recordings", quiet=arguments.quiet) as progress:
         for job, outcome in evaluate_all(jobs, arguments.workers or 1, kept, progress, pool):
             outcomes.append(outcome)
             if not isinstance(outcome, Failure):
@@ -166,7 +163,7 @@ def _result(
     models = sorted({outcome.summary["model"] for outcome in outcomes if not isinstance(outcome, Failure)})
     if len(models) > 1:
         warn(f"the recordings were not evaluated alike: {' and '.join(models)}")
-    return EvaluationResult.of(jobs, outcomes, depends_on)
+    return EvaluationResult.from_outcomes(jobs, outcomes, depends_on)
 
 
 def _pool(arguments: argparse.Namespace, settings: EvaluationSettings) -> "AbstractContextManager[Pool | None]":
@@ -213,20 +210,6 @@ def _warn_of_losses(job: EvaluationJob, scores: "RecordingScores") -> None:
     refusals = scores.summary["truth_refused"]
     if refusals["count"]:
         warn(f"{job.path}: {refusals['count']} times no truth, the first: {refusals['reasons'][0]}")
-
-
-@contextmanager
-def _progress(recordings: int, quiet: bool) -> "Iterator[Progress]":
-    """Show on a terminal how many recordings are done; a fraction counts within the one in hand."""
-    from tqdm import tqdm
-
-    form = "{percentage:3.0f}%|{bar}| {n:.1f} of {total} recordings [{elapsed}<{remaining}]"
-    with tqdm(total=recordings, disable=True if quiet else None, bar_format=form) as bar:
-
-        def show(done: float) -> None:
-            bar.update(done - bar.n)
-
-        yield show
 
 
 def _text(result: "EvaluationResult", folder: Path) -> str:

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from cvcdepth_core.errors import ConfigError
 from cvcdepth_core.model_choices import PRECISIONS, Precision
-from cvcdepth_ros.commands.arguments import add_json, print_result, refuse_to_overwrite
-from cvcdepth_ros.version import package_version
+from cvcdepth_ros.commands.arguments import add_json, refuse_to_overwrite
+from cvcdepth_ros.console import print_result
+from cvcdepth_ros.installation import package_version
 
 if TYPE_CHECKING:
     from cvcdepth_core.networks.checkpoint import Checkpoint
@@ -87,7 +88,7 @@ def _build_tensorrt(checkpoint: "Checkpoint", precision: Precision, device: str)
 
 
 def _description(checkpoint: "Checkpoint") -> dict[str, Any]:
-    """Say what a program needs to use the model."""
+    """Return what a program has to know to use the model."""
     from cvcdepth_core.networks.registry import PER_CAMERA
 
     return {

@@ -13,18 +13,16 @@ from cvcdepth_ros.commands.arguments import (
     add_quiet,
     add_recordings,
     add_skip,
-    can_draw,
     lidar_topics,
-    print_result,
     refuse_unknown_checks,
-    table,
-    warn,
 )
+from cvcdepth_ros.console import print_result, table, warn
+from cvcdepth_ros.reports import REPORT_FILE, can_draw_report
 
 if TYPE_CHECKING:
     from cvcdepth_core.training.config import TrainingConfig
     from cvcdepth_core.training.distributed import Processes
-    from cvcdepth_ros.finetuning.run import FineTuned, Order
+    from cvcdepth_ros.finetuning.run import FinetuneJob, FinetuneResult
 
 SUMMARY = """Train depth from recordings, without labels, and prove that it got better.
 
@@ -38,7 +36,7 @@ EXAMPLES: tuple[str, ...] = (
     "finetune monday.mcap tuesday.mcap --config shuttle.yaml --from-scratch --rig shuttle_rig.yaml -o run",
 )
 
-_RESULT_FILE, _REPORT_FILE = "finetune.json", "report.html"
+_RESULT_FILE = "finetune.json"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -70,14 +68,14 @@ def execute(arguments: argparse.Namespace) -> None:
     refuse_unknown_checks(arguments)
     config = _training_config(arguments.config)
     with launched_processes() as processes:
-        with_report = processes.is_first and can_draw(_REPORT_FILE)
-        tuned = _fine_tuned(arguments, config, processes)
-    if tuned is None:
+        with_report = processes.is_first and can_draw_report()
+        finished = _fine_tuned(arguments, config, processes)
+    if finished is None:
         return
-    result = _written(tuned, with_report)
+    result = _written(finished, with_report)
     print_result(result, _text(result), arguments.json)
-    if not tuned.verdict.promoted:
-        raise NotPromotedError(f"{arguments.output / BEST_FILE} is not written: {tuned.verdict.reason}")
+    if not finished.verdict.promoted:
+        raise NotPromotedError(f"{arguments.output / BEST_FILE} is not written: {finished.verdict.reason}")
 
 
 def _training_config(path: Path) -> "TrainingConfig":
@@ -93,27 +91,29 @@ def _training_config(path: Path) -> "TrainingConfig":
     return config
 
 
-def _fine_tuned(arguments: argparse.Namespace, config: "TrainingConfig", processes: "Processes") -> "FineTuned | None":
+def _fine_tuned(
+    arguments: argparse.Namespace, config: "TrainingConfig", processes: "Processes"
+) -> "FinetuneResult | None":
     from cvcdepth_ros.finetuning.run import fine_tune
     from cvcdepth_ros.finetuning.tensorboard import WITHOUT_TENSORBOARD, has_tensorboard
 
-    order = _order(arguments, config)
+    job = _job(arguments, config)
     if processes.is_first and not has_tensorboard():
         warn(WITHOUT_TENSORBOARD)
     try:
-        return fine_tune(order, processes, warn)
+        return fine_tune(job, processes, warn)
     except KeyboardInterrupt:
         warn("interrupted; the same command goes on from the last checkpoint")
         raise
 
 
-def _order(arguments: argparse.Namespace, config: "TrainingConfig") -> "Order":
+def _job(arguments: argparse.Namespace, config: "TrainingConfig") -> "FinetuneJob":
     from cvcdepth_core.model_choices import checkpoint_path
     from cvcdepth_core.networks.checkpoint import load_checkpoint
     from cvcdepth_core.rig.rig_file import load_rig_layout
     from cvcdepth_ros.bags import find_recordings
     from cvcdepth_ros.finetuning.preparation import Source
-    from cvcdepth_ros.finetuning.run import Order
+    from cvcdepth_ros.finetuning.run import FinetuneJob
     from cvcdepth_ros.settings import MatchingSettings
 
     source = Source(
@@ -125,22 +125,22 @@ def _order(arguments: argparse.Namespace, config: "TrainingConfig") -> "Order":
         lidar_topics(arguments),
     )
     start = None if arguments.start is None else load_checkpoint(checkpoint_path(arguments.start))
-    return Order(source, config, arguments.output, start, arguments.device, arguments.quiet)
+    return FinetuneJob(source, config, arguments.output, start, arguments.device, arguments.quiet)
 
 
-def _written(tuned: "FineTuned", with_report: bool) -> dict[str, Any]:
+def _written(finished: "FinetuneResult", with_report: bool) -> dict[str, Any]:
     """Write the card, the page if wanted, and the result; return the result."""
     from cvcdepth_ros.finetuning.card import model_card, write_card
 
-    run, card = tuned.order.run, model_card(tuned)
+    run, card = finished.job.run, model_card(finished)
     write_card(run, card)
     if with_report:
         from cvcdepth_ros.reports.finetuning_page import write_report
 
-        write_report(run / _REPORT_FILE, tuned, card)
+        write_report(run / REPORT_FILE, finished, card)
     shown = ("started_from", "version", "promoted", "verdict", "scores", "left_out", "warnings", "configuration")
     result = {
-        "checkpoint": str(tuned.weights),
+        "checkpoint": str(finished.weights),
         "sha256": card["weights"]["sha256"],
         "step": card["weights"]["step"],
         "recordings": card["data"],
@@ -167,16 +167,12 @@ def _text(result: dict[str, Any]) -> str:
 
 
 def _score_table(scores: dict[str, Any]) -> str:
-    from cvcdepth_ros.finetuning.card import SCORE_TITLES
+    from cvcdepth_ros.finetuning.card import SCORE_TITLES, score_pairs
 
     before, after = scores["before"]["cameras"], scores["after"]["cameras"]
     rows = [
-        (camera, *(_pair(numbers[name], after.get(camera, {}).get(name)) for name in SCORE_TITLES))
+        (camera, *score_pairs(numbers, after.get(camera, {}), arrow="->", unknown="-"))
         for camera, numbers in before.items()
     ]
     header = ("before -> after", *SCORE_TITLES.values())
     return table(header, rows, numbers=range(1, len(header)))
-
-
-def _pair(before: float | None, after: float | None) -> str:
-    return " -> ".join("-" if number is None else f"{number:.3f}" for number in (before, after))

@@ -13,12 +13,10 @@ from cvcdepth_ros.commands.arguments import (
     add_quiet,
     add_recordings,
     add_window,
-    print_result,
     recording_progress,
-    table,
-    warn,
     window_ns,
 )
+from cvcdepth_ros.console import print_result, table, warn
 
 if TYPE_CHECKING:
     from cvcdepth_ros.bags import Location

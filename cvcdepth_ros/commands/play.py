@@ -7,17 +7,8 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from cvcdepth_core.errors import ConfigError, RecordingError
-from cvcdepth_ros.commands.arguments import (
-    add_json,
-    add_recording,
-    add_window,
-    non_negative,
-    positive,
-    print_result,
-    table,
-    warn,
-    window_ns,
-)
+from cvcdepth_ros.commands.arguments import add_json, add_recording, add_window, window_ns
+from cvcdepth_ros.console import non_negative, positive, print_result, table, warn
 
 if TYPE_CHECKING:
     from cvcdepth_ros.bags import Recording

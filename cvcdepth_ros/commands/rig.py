@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cvcdepth_core.errors import ConfigError
-from cvcdepth_ros.commands.arguments import add_json, add_recording, print_result, refuse_to_overwrite, table
-from cvcdepth_ros.version import package_version
+from cvcdepth_ros.commands.arguments import add_json, add_recording, refuse_to_overwrite
+from cvcdepth_ros.console import print_result, table
+from cvcdepth_ros.installation import package_version
 
 if TYPE_CHECKING:
     from cvcdepth_core.rig.rig import Camera, Rig
@@ -58,7 +59,7 @@ def execute(arguments: argparse.Namespace) -> None:
                 refuse_to_overwrite(*(folder / f"{name}.png" for name in layout.names))
             layout = _with_found_masks(recorded.with_layout(layout), folder)
     result = _describe(layout, layout.complete())
-    source = f"bag_replay rig {package_version()}, from the recording {path.name}"
+    source = f"cvcdepth rig {package_version()}, from the recording {path.name}"
     save_rig_layout(arguments.output, layout, f"Written by {source}.\n{_overlaps_text(result)}")
     result = {"file": str(arguments.output), "recording": arguments.recording, **result}
     print_result(result, _text(result), arguments.json)

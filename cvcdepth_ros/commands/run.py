@@ -14,19 +14,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from cvcdepth_core.errors import RecordingError
 from cvcdepth_core.files import write_json
-from cvcdepth_ros.commands.arguments import (
-    add_json,
-    add_recording,
-    add_settings,
-    add_window,
-    print_result,
-    settings_from,
-    table,
-    warn,
-    window_ns,
-)
+from cvcdepth_ros.commands.arguments import add_json, add_recording, add_settings, add_window, settings_from, window_ns
+from cvcdepth_ros.console import print_result, progress_bar, table, warn
+from cvcdepth_ros.installation import package_version
 from cvcdepth_ros.settings import MatchingSettings, MissingCameraSettings, ModelSettings, OutputSettings
-from cvcdepth_ros.version import package_version
 
 if TYPE_CHECKING:
     from cvcdepth_ros.bags import Recording
@@ -155,16 +146,13 @@ def _with_progress(
     sets: "Iterator[EstimatedSet[RecordedImage]]", seconds: float, quiet: bool
 ) -> "Iterator[EstimatedSet[RecordedImage]]":
     """Show on a terminal how much of the recording is done."""
-    from tqdm import tqdm
-
-    form = "{percentage:3.0f}%|{bar}| {n:.1f} of {total:.1f} s recorded{postfix} [{elapsed}<{remaining}]"
     first = None
-    with tqdm(total=seconds, disable=True if quiet else None, bar_format=form, postfix="0 sets") as bar:
+    with progress_bar(seconds, "s recorded", quiet=quiet) as show:
+        show(0.0, "0 sets")
         for number, estimated in enumerate(sets, 1):
             yield estimated
             first = first or estimated.surround_set.stamp_ns
-            bar.set_postfix_str(f"{number} sets", refresh=False)
-            bar.update((estimated.surround_set.stamp_ns - first) / 1e9 - bar.n)
+            show((estimated.surround_set.stamp_ns - first) / 1e9, f"{number} sets")
 
 
 @contextmanager

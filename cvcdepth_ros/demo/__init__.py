@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m cvcdepth_ros.demo`: a recording played to the live node over DDS, and what came of it."""
+"""`python -m cvcdepth_ros.demo`: a recording played to the live node over DDS, and what it publishes."""

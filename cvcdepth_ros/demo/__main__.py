@@ -14,12 +14,11 @@ from typing import Any
 
 import yaml
 from pydantic import ValidationError
-from tqdm import tqdm
 
 from cvcdepth_core.errors import ConfigError, CvcDepthError, first_validation_message
 from cvcdepth_core.rig.rig_file import RigLayout, load_rig_layout
 from cvcdepth_ros.bags import open_recording
-from cvcdepth_ros.commands.arguments import positive
+from cvcdepth_ros.console import positive, progress_bar
 from cvcdepth_ros.demo.pace import manageable_rate
 from cvcdepth_ros.demo.recorded_lidar import RecordedLidar
 from cvcdepth_ros.demo.result import DemoResult
@@ -28,13 +27,13 @@ from cvcdepth_ros.end_to_end.live_run import LiveOutcome, LiveRun
 from cvcdepth_ros.end_to_end.paths import DemoPaths
 from cvcdepth_ros.end_to_end.processes import children
 from cvcdepth_ros.end_to_end.received import Output, ReceivedSets, node_outputs, sent_sets
-from cvcdepth_ros.settings import ModelSettings
-from cvcdepth_ros.version import package_version
+from cvcdepth_ros.installation import package_version
+from cvcdepth_ros.settings import MatchingSettings, ModelSettings
 
 SAMPLE = Path(__file__).parents[2] / "samples" / "pandaset_002_excerpt"
 NODE = "/surround_depth"
 
-_TOLERANCE_SECONDS = 0.1
+_TOLERANCE_SECONDS = MatchingSettings().tolerance
 _SAMPLE_CREDIT = "Recording: PandaSet by Hesai and Scale AI, CC BY 4.0"
 _EXAMPLE = """example:
   python -m cvcdepth_ros.demo --output output/demo
@@ -59,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run(options: argparse.Namespace) -> DemoResult:
-    """Play, record, count, draw and tell."""
+    """Play the recording to the node, write what it publishes and print a summary; DemoError when a process fails."""
     model = _model(options)
     paths = DemoPaths(options.output)
     paths.prepare()
@@ -68,7 +67,7 @@ def run(options: argparse.Namespace) -> DemoResult:
     with children(paths.logs) as family:
         live = LiveRun(family, paths, NODE)
         live.write_rig(options.recording)
-        setup = Setup.of(options.recording, model, paths)
+        setup = Setup.from_rig_file(options.recording, model, paths)
         setup.write_parameters(paths)
         rate = options.rate or setup.manageable_rate()
         print(f"playing {setup.recording.name} at {rate:.3g} times real time")
@@ -82,18 +81,18 @@ def run(options: argparse.Namespace) -> DemoResult:
 
 @dataclass(frozen=True)
 class Setup:
-    """What is played, and how the node is set up for it."""
+    """The recording that is played, and the node's configuration for it."""
 
     recording: Path
     layout: RigLayout
     model: ModelSettings
     parameters: dict[str, Any]
-    """The node's."""
+    """The node's parameters."""
     outputs: list[Output]
 
     @classmethod
-    def of(cls, recording: Path, model: ModelSettings, paths: DemoPaths) -> "Setup":
-        """Set up for the rig file that was written before."""
+    def from_rig_file(cls, recording: Path, model: ModelSettings, paths: DemoPaths) -> "Setup":
+        """Return the setup for the rig file that `paths` names."""
         layout = load_rig_layout(paths.rig)
         parameters = {
             "use_sim_time": True,
@@ -110,7 +109,7 @@ class Setup:
         paths.parameters.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
 
     def manageable_rate(self) -> float:
-        """Measure how fast the recording may be played here."""
+        """Return how fast the recording may be played here, which is measured."""
         with open_recording(self.recording) as recording:
             return manageable_rate(recording, self.layout, self.model)
 
@@ -122,7 +121,7 @@ class Setup:
 
 
 def _model(options: argparse.Namespace) -> ModelSettings:
-    """Return the network that was asked for; ConfigError when it cannot be."""
+    """Return the network of the options; ConfigError names one with an impossible value."""
     if options.checkpoint:
         return ModelSettings.model_validate({"checkpoint": str(options.checkpoint.absolute())})
     if not options.untrained:
@@ -134,14 +133,15 @@ def _model(options: argparse.Namespace) -> ModelSettings:
 
 
 def _show(setup: Setup, paths: DemoPaths, outcome: LiveOutcome) -> DemoResult:
-    """Draw what arrived, count it, and write pictures, result and page."""
+    """Write pictures, result and page of what arrived; return the result."""
     with open_recording(setup.recording) as recording:
         sets = sent_sets(recording, setup.layout, _TOLERANCE_SECONDS, outcome.sent)
         received = ReceivedSets(paths.recording, setup.outputs, sets)
         lidar = RecordedLidar(recording, setup.layout)
         writer = SheetWriter(setup.layout.complete(), lidar, paths.sheets, setup.notes(outcome), setup.model.untrained)
-        for _ in tqdm(writer.write(received, len(sets)), desc="drawing", total=outcome.node.published, disable=None):
-            pass
+        with progress_bar(outcome.node.published, "sets", label="drawing", decimals=0) as show:
+            for number, _ in enumerate(writer.write(received, len(sets)), 1):
+                show(number)
     result = DemoResult(
         version=package_version(),
         recording=str(setup.recording),

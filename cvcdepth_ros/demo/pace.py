@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How fast a recording may be played so that this machine manages every set."""
+"""The rate at which a recording may be played so that this machine keeps up with every set."""
 
 import os
 import time
@@ -18,7 +18,7 @@ _FASTEST, _SLOWEST_SECONDS = 1.0, 6.0
 
 
 def manageable_rate(recording: Recording, layout: RigLayout, model: ModelSettings) -> float:
-    """Return the rate at which the node has four times as long for a set as its inference takes.
+    """Return the rate at which a set's inference takes a quarter of the time until the next set.
 
     That is measured, with the node's own network on this machine; at most real time, at least a set in six seconds.
     """
@@ -30,7 +30,7 @@ def manageable_rate(recording: Recording, layout: RigLayout, model: ModelSetting
 
 
 def _inference_seconds(surround: SurroundDepthEstimator) -> float:
-    """Time the estimator on one black set; a first run, which sets things up, does not count."""
+    """Return the seconds of one set's inference, on black pictures, after a first run that builds what is reused."""
     if THREADS_VARIABLE not in os.environ:
         torch.set_num_threads(spared_threads())
     surround.warm_up()

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What came of a demo run: counted from what was sent, what the node said of itself, and what arrived."""
+"""The result of a demo: counts of what was sent, of what the node reported, and of what arrived."""
 
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
-from cvcdepth_ros.commands.arguments import table
+from cvcdepth_ros.console import table
 from cvcdepth_ros.messages.node_report import NodeReport
 
 UNTRAINED_WARNING = "UNTRAINED NETWORK: this depth means nothing"
@@ -17,7 +17,7 @@ class DemoResult(BaseModel):
     model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
 
     version: str
-    """Of the package."""
+    """The package's version."""
     recording: str
     """What was played."""
     rate: float
@@ -44,7 +44,7 @@ class DemoResult(BaseModel):
     """By topic: what DDS lost on the way to the recorder; only topics that lost any."""
 
     def problems(self) -> list[str]:
-        """Say what went wrong; nothing when every set was matched and every published set arrived."""
+        """Return what went wrong; nothing when every set was matched and every published set arrived."""
         node = self.node
         checks = {
             "the recording has no set of which every image was sent": self.sent > 0,
@@ -56,7 +56,7 @@ class DemoResult(BaseModel):
         return [problem for problem, passed in checks.items() if not passed]
 
     def counts(self) -> list[tuple[str, str]]:
-        """Lay out what became of sets and images, a name and a value each."""
+        """Return the counts of sets and images as rows of name and value."""
         return [
             ("speed, 1 is real time", f"{self.rate:.3g}"),
             ("sets sent complete", str(self.sent)),
@@ -71,7 +71,7 @@ class DemoResult(BaseModel):
         ]
 
     def latencies(self) -> list[tuple[str, str, str]]:
-        """Lay out the stages, each with p50 and p95 in milliseconds."""
+        """Return the stages as rows of name, p50 and p95 in milliseconds."""
         return [(stage, f"{t.p50_ms:.1f}", f"{t.p95_ms:.1f}") for stage, t in self.node.latencies.items()]
 
     def text(self) -> str:

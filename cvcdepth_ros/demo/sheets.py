@@ -16,8 +16,8 @@ from cvcdepth_ros.demo.recorded_lidar import RecordedLidar
 from cvcdepth_ros.demo.result import UNTRAINED_WARNING, DemoResult
 from cvcdepth_ros.end_to_end.received import ReceivedSet
 from cvcdepth_ros.reports.animation_page import Table, animation_page
+from cvcdepth_ros.reports.style import to_jpeg
 
-_JPEG_QUALITY = 85
 _PNG_COMPRESSION = 6
 
 
@@ -25,7 +25,7 @@ class SheetWriter:
     """Draws sets, writes each as PNG, and keeps a JPEG of each for the page."""
 
     def __init__(self, rig: Rig, lidar: RecordedLidar, folder: Path, notes: list[str], untrained: bool) -> None:
-        """Draw for one rig and recording into `folder`; `notes` are the last lines below every picture."""
+        """Draw sets of one rig and recording into `folder`, with `notes` as the last lines below each."""
         self._rig = rig
         self._lidar = lidar
         self._folder = folder
@@ -34,16 +34,16 @@ class SheetWriter:
         self.jpegs: list[bytes] = []
 
     def write(self, received: Iterable[ReceivedSet], total: int) -> Iterator[Path]:
-        """Draw one set after the other; `total` is the number of sets that were sent. Gives the files."""
+        """Draw one set after the other and give the files; `total` is the number of sets that were sent."""
         for surround in received:
             sheet = self._draw(surround, total)
             path = self._folder / f"set_{surround.sent.sequence + 1:03d}.png"
-            path.write_bytes(_encoded(sheet, ".png", cv2.IMWRITE_PNG_COMPRESSION, _PNG_COMPRESSION))
-            self.jpegs.append(_encoded(sheet, ".jpg", cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY))
+            path.write_bytes(_png(sheet))
+            self.jpegs.append(to_jpeg(sheet))
             yield path
 
     def page(self, title: str, result: DemoResult) -> str:
-        """Return the HTML page of all that was written."""
+        """Return the HTML page with all sets that were drawn, and the result's tables."""
         tables: list[Table] = [("What became of it", result.counts()), ("Latency, ms: p50, p95", result.latencies())]
         return animation_page(title, UNTRAINED_WARNING if self._untrained else "", self.jpegs, tables, self._notes)
 
@@ -71,6 +71,7 @@ class SheetWriter:
         return points, f"{seen}, {'LiDAR in cyan' if points is not None else 'no LiDAR recorded'}"
 
 
-def _encoded(picture: Picture, extension: str, option: int, value: int) -> bytes:
-    _, encoded = cv2.imencode(extension, np.ascontiguousarray(picture[..., ::-1]), [option, value])
+def _png(picture: Picture) -> bytes:
+    options = [cv2.IMWRITE_PNG_COMPRESSION, _PNG_COMPRESSION]
+    _, encoded = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]), options)
     return bytes(encoded)

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The live part of the demo: node, recorder and player, each a process of its own, as on a vehicle."""
+"""A recording played to a live node, whose outputs are recorded: three processes, as on a vehicle."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
+from cvcdepth_ros.console import progress_bar
 from cvcdepth_ros.end_to_end.paths import DemoPaths
 from cvcdepth_ros.end_to_end.processes import Child, Children, DemoError, wait_until
 from cvcdepth_ros.end_to_end.received import Output
@@ -21,7 +20,7 @@ _EQUAL_REPORTS = 2
 
 @dataclass(frozen=True)
 class LiveOutcome:
-    """What the processes said at the end."""
+    """What was sent and received, and the node's last report."""
 
     rate: float
     """How many times real time it was played."""
@@ -37,7 +36,7 @@ class LiveOutcome:
 
 
 class LiveRun:
-    """Starts the processes one after the other, each when the former is ready for it."""
+    """Starts player, node and recorder one after the other, each when the former is ready for it."""
 
     def __init__(
         self,
@@ -47,7 +46,7 @@ class LiveRun:
         module: str = "cvcdepth_ros.surround_depth_node",
         inputs: Mapping[str, str] | None = None,
     ) -> None:
-        """Take the node's program from `module`; `inputs` are topics of the player, and their types, to record too."""
+        """Run the node's program from `module`; `inputs` are the player's topics to record, with their types."""
         self._family = family
         self._paths = paths
         self._node_name = node
@@ -57,7 +56,7 @@ class LiveRun:
         self._equal_reports = 0
 
     def write_rig(self, recording: Path) -> None:
-        """Have the rig file written from the recording."""
+        """Write the rig file, by `cvcdepth rig`."""
         rig = self._family.start("rig", "cvcdepth_ros.bag_replay", "rig", str(recording), "-o", str(self._paths.rig))
         wait_until("for the rig file", lambda: rig.ended(_POLL_SECONDS), _START_SECONDS)
 
@@ -92,14 +91,14 @@ class LiveRun:
         return self._family.start("player", "cvcdepth_ros.bag_replay", "play", str(recording), *span, *options)
 
     def _follow(self, player: Child) -> None:
-        """Wait for the player's end, showing how many sets have been published."""
-        with tqdm(desc="playing", bar_format="{desc}: {n_fmt} sets published, {elapsed}", disable=None) as bar:
+        """Wait for the player's end; a bar shows how many sets have been published."""
+        with progress_bar(None, "sets published", label="playing", decimals=0) as show:
             while not player.ended():
                 self._read_reports()
-                bar.update(self._published() - bar.n)
+                show(self._published())
 
     def _end(self, player: Child, rate: float) -> LiveOutcome:
-        """Stop the recorder, which then says what it has."""
+        """Stop the recorder, and return what was sent and received."""
         self._recorder.stop()
         self._recorder.ended()
         summary = list(self._recorder.reports(0.0))[-1]
@@ -117,7 +116,7 @@ class LiveRun:
         return bool(self._report.get("ready"))
 
     def _settled(self) -> bool:
-        """Whether nothing is under way any more: the node says so, and nothing changes from report to report."""
+        """Return whether the node has nothing in hand, by its own report and since its reports no longer change."""
         self._read_reports()
         return self._equal_reports >= _EQUAL_REPORTS and NodeReport.model_validate(self._report["node"]).settled()
 
@@ -125,7 +124,7 @@ class LiveRun:
         return NodeReport.model_validate(self._report["node"]).published
 
     def _read_reports(self) -> None:
-        """Take over the recorder's reports, waiting a moment for one. DemoError says what went wrong."""
+        """Read the recorder's new reports, waiting a moment for one; DemoError when a process or the node failed."""
         for child in (self._node, self._recorder):
             if child.ended():
                 raise child.failure("ended too early")

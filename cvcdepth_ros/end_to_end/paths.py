@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the demo writes, all in one folder."""
+"""The files of a live run, all in one folder."""
 
 import shutil
 from pathlib import Path

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The demo's child processes: in a DDS domain of their own, watched, and always stopped, each by its own pid."""
+"""Child processes in a DDS domain of their own: watched, and always stopped, each by its own pid."""
 
 import errno
 import json
@@ -32,7 +32,7 @@ class DemoError(CvcDepthError):
 
 
 class Child:
-    """One Python program of ours as a child process; its output goes to a log file, the lines of stdout also here."""
+    """A Python program as a child process; its output goes to a log file, and the lines of stdout can be read here."""
 
     def __init__(self, name: str, arguments: Sequence[str], environment: Mapping[str, str], log: Path) -> None:
         """Start `python -m ARGUMENTS`, with the interpreter that is running."""
@@ -56,7 +56,7 @@ class Child:
         self._reader.start()
 
     def ended(self, timeout: float = 0.0) -> bool:
-        """Whether it is over, at latest after `timeout` seconds. DemoError, with its last lines, when it failed."""
+        """Return whether it has ended within `timeout` seconds; DemoError, with its last lines, when it failed."""
         try:
             code = self._process.wait(timeout)
         except subprocess.TimeoutExpired:
@@ -67,7 +67,7 @@ class Child:
         return True
 
     def reports(self, timeout: float) -> Iterator[dict[str, Any]]:
-        """Give the JSON objects among the lines it has printed since the last call; wait for a first one."""
+        """Give the JSON objects printed since the last call; a first one is waited for up to `timeout` seconds."""
         try:
             yield from _json_object(self._lines.get(timeout=timeout))
             while True:
@@ -76,7 +76,7 @@ class Child:
             return
 
     def result(self) -> dict[str, Any]:
-        """Return the JSON document that it has printed; DemoError when there is none. Call it after the end."""
+        """Return the JSON document that it has printed, once it has ended; DemoError when there is none."""
         lines = [self._lines.get() for _ in range(self._lines.qsize())]
         # Where /dev/shm is small, as in Docker, FastDDS says so on stdout, and goes on over UDP.
         printed = "".join(dropwhile(lambda line: not line.startswith("{"), lines))
@@ -87,7 +87,7 @@ class Child:
         return document
 
     def peak_memory_mb(self) -> float:
-        """Return its greatest resident size so far in MiB, as Linux tells; 0 where nothing does."""
+        """Return its greatest resident size so far in MiB; 0 where /proc does not tell it."""
         try:
             lines = Path(f"/proc/{self._process.pid}/status").read_text(encoding="utf-8").splitlines()
         except OSError:
@@ -96,7 +96,7 @@ class Child:
         return int(peak.split()[1]) / 2**10
 
     def failure(self, reason: str) -> DemoError:
-        """Return the error that names it, with its last lines."""
+        """Return an error with its name, the reason and the last lines of its log."""
         lines = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()[-_LAST_LINES:]
         said = "".join(f"\n  {line}" for line in lines) or " (it printed nothing)"
         return DemoError(f"{self.name} {reason}; see {self.log}:{said}")
@@ -121,7 +121,7 @@ class Child:
 
 
 class Children:
-    """All of them, in one DDS domain that no packet leaves the machine from."""
+    """A family of child processes in one DDS domain, which no packet leaves."""
 
     def __init__(self, logs: Path) -> None:
         """Choose the domain; `logs` is the folder for their log files."""
@@ -188,7 +188,7 @@ def free_domain() -> int:
 
 
 def _is_free(domain: int) -> bool:
-    """Whether the unicast discovery port of the domain's first participant (RTPS 9.6.2) can be bound."""
+    """Return whether the unicast discovery port of the domain's first participant (RTPS 9.6.2) can be bound."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.bind(("0.0.0.0", 7400 + 250 * domain + 10))

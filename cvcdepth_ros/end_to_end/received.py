@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The surround sets that a recording holds, and those that the recorder got from the node."""
+"""The surround sets that were sent to a node, and those that its outputs make up."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -23,7 +23,7 @@ SentSet = SurroundSet[int]
 
 @dataclass(frozen=True)
 class Output:
-    """One topic of the node."""
+    """A topic that the node publishes."""
 
     topic: str
     type_name: str
@@ -34,7 +34,7 @@ class Output:
 
 
 def node_outputs(node: str, cameras: Sequence[str], anchor: str) -> list[Output]:
-    """List what of the outputs of the node called `node` makes a set: one message of each."""
+    """Return the topics of the node called `node` of which one message each makes a set."""
     types = output_types(cameras)
     parts = [(camera, part, f"{camera}/{part}") for camera in cameras for part in (DEPTH, DEPTH_INFO, PICTURE)]
     parts.append((anchor, MERGED_CLOUD, MERGED_CLOUD))
@@ -57,7 +57,7 @@ def sent_sets(recording: Recording, layout: RigLayout, tolerance: float, sent: M
 
 @dataclass(frozen=True, eq=False)
 class ReceivedSet:
-    """One set of which every message arrived; arrays hold the cameras in the rig's order."""
+    """A set of which every message arrived; arrays hold the cameras in the rig's order."""
 
     sent: SentSet
     pictures: NDArray[np.uint8]

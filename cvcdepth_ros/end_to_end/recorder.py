@@ -44,7 +44,7 @@ says of itself, how many messages of each topic have come, and "ready" once no m
 
 
 class Recorder(Node):  # type: ignore[misc] # rclpy is not annotated
-    """Subscribes topics and writes what arrives; `tell` is called with a report whenever the watched node makes one."""
+    """Subscribes topics and writes what arrives; `on_report` is called with each report of the watched node."""
 
     def __init__(
         self,
@@ -52,12 +52,12 @@ class Recorder(Node):  # type: ignore[misc] # rclpy is not annotated
         topics: Mapping[str, str],  # of the watched node, with their types
         inputs: Mapping[str, str],  # others, whose publishers come later
         watched: str,
-        tell: Callable[[dict[str, Any]], None],
+        on_report: Callable[[dict[str, Any]], None],
     ) -> None:
         super().__init__("demo_recorder")
         self._writer = writer
         self._watched = watched
-        self._tell = tell
+        self._on_report = on_report
         self._unmatched = set(topics)
         self.received = dict.fromkeys([*topics, *inputs, DIAGNOSTICS_TOPIC], 0)
         self.lost = dict.fromkeys(self.received, 0)
@@ -70,7 +70,7 @@ class Recorder(Node):  # type: ignore[misc] # rclpy is not annotated
         self._subscribe(DIAGNOSTICS_TOPIC, _DIAGNOSTICS_TYPE, _QOS)
 
     def summary(self) -> dict[str, Any]:
-        """Say what has come, and which topics lost messages."""
+        """Return how many messages of each topic have come, and how many were lost of those that lost any."""
         return {"received": self.received, "lost": {topic: count for topic, count in self.lost.items() if count}}
 
     def _subscribe(self, topic: str, type_name: str, qos: QoSProfile) -> Subscription:
@@ -111,7 +111,7 @@ class Recorder(Node):  # type: ignore[misc] # rclpy is not annotated
             self.last_message = time.monotonic()
 
     def _report(self, cdr: bytes) -> None:
-        """Pass on what the watched node says of itself.
+        """Pass a report of the watched node on, with the counts so far and whether all of its publishers are matched.
 
         That its message arrived means that its publishers know our subscriptions; together with ours knowing its
         publishers, nothing that it publishes from now on can be missed.
@@ -120,7 +120,7 @@ class Recorder(Node):  # type: ignore[misc] # rclpy is not annotated
         if not _HAS_MATCHED_EVENTS:
             self._unmatched = {topic for topic in self._unmatched if not self.count_publishers(topic)}
         if report is not None:
-            self._tell({"ready": not self._unmatched, "node": report.model_dump(), **self.summary()})
+            self._on_report({"ready": not self._unmatched, "node": report.model_dump(), **self.summary()})
 
 
 def record(

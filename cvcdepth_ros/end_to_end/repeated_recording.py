@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A short recording made long enough to measure with: itself again and again, with later and later stamps."""
+"""A short recording made longer: repeated with later and later stamps."""
 
 import struct
 from pathlib import Path
@@ -31,7 +31,7 @@ def write_repeated(recording: Recording, layout: RigLayout, path: Path, seconds:
 
 
 def _restamped(cdr: bytes, later: int) -> bytes:
-    """Move the stamp of a message that begins with a header."""
+    """Return a message that begins with a header, its stamp `later` nanoseconds later."""
     form = "<iI" if cdr[1] else ">iI"  # CDR's encapsulation kind: 0 big-endian, 1 little-endian
     seconds, nanoseconds = struct.unpack_from(form, cdr, _STAMP)
     stamp = struct.pack(form, *divmod(seconds * 10**9 + nanoseconds + later, 10**9))

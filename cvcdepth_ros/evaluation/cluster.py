@@ -25,7 +25,7 @@ _CONNECT_SECONDS = 10.0
 
 @contextmanager
 def ray_pool(settings: EvaluationSettings, address: str | None, workers: int | None) -> Iterator[Pool]:
-    """Connect to the cluster at `address`, or start one on this machine for so many recordings at a time.
+    """Give the workers of the cluster at `address`, or of one that is started here for `workers` recordings at a time.
 
     A recording takes as many CPUs as the settings name threads, and a GPU where there are any for its network. Without
     `workers` it is as many as the machine has CPUs for. Raises ConfigError when Ray is not installed, the cluster
@@ -55,7 +55,7 @@ class RayExecutor(Executor):
         self._running: set[Any] = set()
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Queue a call; its future raises one of Ray's own errors when the worker dies."""
+        """Queue a call and return its future, which raises one of Ray's own errors when the worker dies."""
         import ray
 
         reference = ray.remote(**self._options)(_call).remote(fn, *args, **kwargs)
@@ -73,7 +73,7 @@ class RayExecutor(Executor):
 
 
 def _call(fn: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-    """Stand for any callable: Ray takes plain functions only."""
+    """Call `fn`; Ray takes plain functions only, no other callables."""
     return fn(*args, **kwargs)
 
 
@@ -125,7 +125,7 @@ def _gpus(settings: EvaluationSettings) -> int:
 
 
 def _evaluate_as_here(job: EvaluationJob, expected: Dependencies, folder: Path) -> Outcome:
-    """Evaluate on a machine that has the same program and checkpoint as the one that wants to know.
+    """Evaluate on a machine of the cluster, if it has the same program and checkpoint as the one that asks.
 
     Relative paths are from `folder`, where the machine has it.
     """

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from pydantic import Field, model_validator
 
+from cvcdepth_ros.installation import package_version
 from cvcdepth_ros.settings import LIDAR_TOLERANCE, MatchingSettings, ModelSettings
-from cvcdepth_ros.version import package_version
 
 if TYPE_CHECKING:
     from cvcdepth_core.estimator import DepthPredictor

@@ -35,10 +35,10 @@ class Failure(NamedTuple):
 
 
 class Model(NamedTuple):
-    """What was evaluated."""
+    """The network or reference that was evaluated."""
 
     id: str
-    """What reports call it."""
+    """Its name in reports."""
     checkpoint: str | None
     """The checkpoint's path; None for an untrained network or a reference."""
     sha256: str | None
@@ -57,10 +57,10 @@ class EvaluationResult:
     failed: Sequence[Failure]
 
     @classmethod
-    def of(
+    def from_outcomes(
         cls, jobs: Sequence[EvaluationJob], outcomes: Iterable[RecordingScores | Failure], depends_on: Dependencies
     ) -> EvaluationResult:
-        """Join what became of the jobs, in any order, all of the same settings.
+        """Return the result of jobs that differ in nothing but the recording; their outcomes come in any order.
 
         Raises RecordingError, with the first reason, when none could be evaluated.
         """
@@ -76,32 +76,32 @@ class EvaluationResult:
 
     @cached_property
     def scores(self) -> Scores:
-        """The rows of all recordings."""
+        """The scores of all recordings together."""
         return Scores.merged(recording.scores for recording in self.recordings)
 
     @property
     def agreement(self) -> list[AgreementTable]:
-        """The label-free comparisons of all recordings."""
+        """The label-free comparisons, one table for each recording."""
         return [recording.agreement for recording in self.recordings]
 
     @property
     def images(self) -> Iterator[ImageScore]:
-        """All scores, image by image; made while they are asked for."""
+        """The scores image by image, computed while one iterates."""
         return chain.from_iterable(image_scores(self.scores, self.agreement))
 
     @cached_property
     def sets(self) -> list[SetScore]:
-        """All scores, set by set."""
+        """The scores set by set."""
         numbers = chain.from_iterable(range(len(table)) for table in self.scores.images)
         return list(map(SetScore.from_images, numbers, image_scores(self.scores, self.agreement)))
 
     def summary(self, protocol: EvaluationProtocol = "image", scaling: Scaling = "metric") -> Summary:
-        """Take the means over all recordings."""
+        """Return the means over all recordings."""
         return self.scores.summary(protocol, scaling)
 
     @property
     def truth_points(self) -> int:
-        """Pixels with truth, inside the depth limits."""
+        """How many pixels have truth inside the depth limits."""
         return sum(int(recording.summary["truth_points"]) for recording in self.recordings)
 
     def to_json(self) -> dict[str, Any]:
@@ -131,7 +131,7 @@ class EvaluationResult:
 
 @dataclass(frozen=True)
 class StoredResult:
-    """What a comparison needs of a `metrics.json`."""
+    """The part of a `metrics.json` that a comparison needs."""
 
     model_id: str
     scores: Scores
@@ -141,7 +141,7 @@ class StoredResult:
 
     @classmethod
     def read(cls, path: Path) -> StoredResult:
-        """Read a `metrics.json`; ConfigError when the file is no such thing."""
+        """Read a `metrics.json`; ConfigError when the file is none."""
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
             schema, model_id, rows = content["schema"], content["model"]["id"], content["rows"]
@@ -154,7 +154,7 @@ class StoredResult:
         return cls(str(model_id), Scores.from_json(rows), configuration, lidars)
 
     def measured_differently(self, other: StoredResult) -> list[str]:
-        """Name what makes their numbers differ beside the models: options, and LiDARs that were found."""
+        """Return the names of the options and found LiDARs that differ, so that not only the models do."""
         options = [
             name for name in _DECIDE_WHAT_IS_MEASURED if self.configuration.get(name) != other.configuration.get(name)
         ]
@@ -164,7 +164,7 @@ class StoredResult:
 
 
 def comparison_to_json(first: StoredResult, second: StoredResult) -> dict[str, Any]:
-    """Compare two results over the sets that both have, depth as predicted and median-scaled."""
+    """Return the content of `comparison.json`: two results over the sets that both have, metric and median-scaled."""
     found = {scaling: compare(first.scores, second.scores, scaling=scaling) for scaling in SCALINGS}
     return {
         "schema": SCHEMA,

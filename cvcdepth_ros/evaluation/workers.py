@@ -1,11 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many recordings, each a unit of work: in this process or in several, finished ones kept for the next run."""
+"""Evaluation of many recordings, one after the other or several at a time; finished ones are kept for the next call."""
 
 from __future__ import annotations
 
-import hashlib
-import io
-import json
 import logging
 import multiprocessing
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -13,89 +10,77 @@ from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_complet
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-from zipfile import BadZipFile
-
-import numpy as np
 
 from cvcdepth_core.errors import CvcDepthError
-from cvcdepth_core.files import write_atomically
 from cvcdepth_ros.bags import file_identities
 from cvcdepth_ros.evaluation.job import Dependencies, EvaluationJob
 from cvcdepth_ros.evaluation.measuring import Progress, RecordingScores, evaluate_recording
 from cvcdepth_ros.evaluation.result import Failure
+from cvcdepth_ros.kept import KeptResults, Work
 
 Outcome = RecordingScores | Failure
 
 _logger = logging.getLogger(__name__)
 
 
-class KeptParts:
-    """The finished recordings' scores, one file each, which hold for the very same work only."""
+class KeptScores:
+    """The finished recordings' scores, which hold for the very same recording, settings, program and checkpoint."""
 
     def __init__(self, folder: Path, depends_on: Dependencies) -> None:
-        self._folder = folder
+        self._results = KeptResults(folder, RecordingScores.to_arrays, RecordingScores.from_arrays)
         self._depends_on = depends_on
 
     def load(self, job: EvaluationJob) -> RecordingScores | None:
-        """Return the scores of a former run; None where there are none, or of another work."""
-        try:
-            with np.load(self._path(job), allow_pickle=False) as arrays:
-                known = json.loads(arrays["work"].tobytes()) == self._work(job)
-                return RecordingScores.from_arrays(arrays) if known else None
-        except (OSError, ValueError, KeyError, TypeError, BadZipFile, CvcDepthError):
-            return None  # not there, or cut by whatever ended the former run: then the work is done again
+        """Return the scores of a former call; None where there are none, or of other work."""
+        work = self._work(job)
+        return None if work is None else self._results.load(job.name, work)
 
     def save(self, job: EvaluationJob, scores: RecordingScores) -> None:
-        """Keep the scores; the file appears whole or not at all."""
-        try:
-            work = self._work(job)
-        except OSError:
-            return  # the recording cannot be reached any more, so nobody can know it again
-        self._folder.mkdir(parents=True, exist_ok=True)
-        content = io.BytesIO()
-        arrays: dict[str, Any] = {"work": np.frombuffer(json.dumps(work).encode(), dtype=np.uint8)} | scores.to_arrays()
-        np.savez(content, **arrays)
-        write_atomically(self._path(job), content.getvalue())
+        """Keep the scores; not those of a recording that cannot be reached any more, which nobody could know again."""
+        work = self._work(job)
+        if work is not None:
+            self._results.save(job.name, work, scores)
 
-    def _path(self, job: EvaluationJob) -> Path:
-        return self._folder / f"{hashlib.sha256(job.name.encode()).hexdigest()[:16]}.npz"
-
-    def _work(self, job: EvaluationJob) -> dict[str, Any]:
+    def _work(self, job: EvaluationJob) -> Work | None:
+        """Return all that the job's scores depend on; None where its files cannot be reached."""
         masks = [str(camera.mask) for camera in job.layout.cameras if camera.mask] if job.layout else []
+        try:
+            files = [identity for path in (job.path, *masks) for identity in file_identities(path)]
+        except (OSError, CvcDepthError):
+            return None
         return {
             **self._depends_on._asdict(),
             "configuration": job.configuration(),
             "name": job.name,
             "path": job.path,
-            "files": [identity for path in (job.path, *masks) for identity in file_identities(path)],
+            "files": files,
         }
 
 
 @dataclass(frozen=True)
 class Pool:
-    """Where recordings are evaluated at the same time."""
+    """Workers that evaluate several recordings at the same time."""
 
     open: Callable[[int], Executor]
-    """Gives an executor for so many at a time."""
+    """Returns an executor for this many recordings at a time."""
     died: tuple[type[Exception], ...]
-    """What a call's future raises when the worker dies."""
+    """The exceptions of a call's future when its worker dies."""
     work: Callable[[EvaluationJob], Outcome]
-    """Evaluates one recording over there."""
+    """Evaluates one recording, in a worker."""
 
 
 def evaluate_all(
     jobs: Sequence[EvaluationJob],
     workers: int = 1,
-    kept: KeptParts | None = None,
+    kept: KeptScores | None = None,
     progress: Progress | None = None,
     pool: Pool | None = None,
 ) -> Iterator[tuple[EvaluationJob, Outcome]]:
-    """Evaluate recordings and give each as soon as it is finished: in this process, or several at a time in a pool.
+    """Evaluate recordings, in this process or several at a time in a pool; give each as soon as it is finished.
 
     The pool is `workers` processes of this machine unless another is given. A recording that fails, whatever the
-    reason, is a `Failure` and stops no other. What `kept` has is not done again. `progress` is told how many recordings
-    are done.
+    reason, is a `Failure` and stops no other. Recordings that `kept` has are not evaluated again. `progress` is called
+    with the number of recordings that are done.
     """
     done = 0
     missing = []
@@ -120,7 +105,7 @@ def evaluate_all(
 
 
 def evaluate_safely(job: EvaluationJob, progress: Progress | None = None) -> Outcome:
-    """Evaluate a recording; whatever goes wrong becomes a `Failure`."""
+    """Return a recording's scores, or a `Failure` whatever goes wrong."""
     try:
         return evaluate_recording(job, progress)
     except (CvcDepthError, OSError) as error:
@@ -131,7 +116,7 @@ def evaluate_safely(job: EvaluationJob, progress: Progress | None = None) -> Out
 
 
 def _in_pool(pool: Pool, jobs: Sequence[EvaluationJob], workers: int) -> Iterator[tuple[EvaluationJob, Outcome]]:
-    """Where a worker dies, jobs that it took with it are done again, each in an executor of its own."""
+    """Give the outcomes of jobs; those that a dying worker took with it are tried again, each in its own executor."""
     lost = []
     for job, outcome in _with_executor(pool, min(workers, len(jobs)), jobs):
         if outcome is None:
@@ -146,7 +131,7 @@ def _in_pool(pool: Pool, jobs: Sequence[EvaluationJob], workers: int) -> Iterato
 def _with_executor(
     pool: Pool, workers: int, jobs: Iterable[EvaluationJob]
 ) -> Iterator[tuple[EvaluationJob, Outcome | None]]:
-    """Hand the jobs to an executor; None is what became of a job whose worker died."""
+    """Give the outcomes of jobs, None where the worker died."""
     executor = pool.open(workers)
     try:
         futures: dict[Future[Outcome], EvaluationJob] = {executor.submit(pool.work, job): job for job in jobs}
@@ -163,7 +148,7 @@ def _with_executor(
 
 
 def _processes(workers: int) -> ProcessPoolExecutor:
-    """Return fresh interpreters: a forked one would inherit torch's threads and CUDA in a state that does not work."""
+    """Return an executor of fresh interpreters: a forked one would inherit torch's threads and CUDA in a bad state."""
     return ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
 
 

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A fleet's side of training: what comes before, proof on the held-out part, promotion, card and page. No ROS here."""
+"""Fine-tuning on recordings: preparation, held-out scores, verdict and promotion, model card. No ROS here."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The model card beside the weights: what they were made from, how, and what they are proven to be good for."""
+"""The model card beside the weights: what they were made from, how, and how well they score."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_ros.bags import file_identities
 from cvcdepth_ros.evaluation.result import EvaluationResult
 from cvcdepth_ros.finetuning.judgement import camera_numbers, numbers_of
-from cvcdepth_ros.finetuning.run import FineTuned
+from cvcdepth_ros.finetuning.run import FinetuneResult
+from cvcdepth_ros.installation import package_version
 from cvcdepth_ros.training_data.index import RecordingIndex
-from cvcdepth_ros.version import package_version
 
 CARD_FILE, CARD_TEXT_FILE = "model_card.json", "model_card.md"
 
@@ -34,23 +34,24 @@ SCORE_TITLES = {
     "scale": "scale",
     "photometric": "photometric error",
 }
+"""The titles of `camera_numbers` in tables."""
 
 
-def model_card(tuned: FineTuned) -> dict[str, Any]:
+def model_card(result: FinetuneResult) -> dict[str, Any]:
     """Return the card's content, with JSON's types; docs/finetuning.md explains it."""
-    order, trainer = tuned.order, tuned.trainer
-    checkpoint = load_checkpoint(tuned.weights)
-    configuration = order.config.model_dump(mode="json")
+    job, trainer = result.job, result.trainer
+    checkpoint = load_checkpoint(result.weights)
+    configuration = job.config.model_dump(mode="json")
     return {
-        "weights": {"file": tuned.weights.name, "sha256": checkpoint.sha256, "step": checkpoint.metadata.get("step")},
-        "started_from": order.started_from,
-        "promoted": tuned.verdict.promoted,
-        "verdict": tuned.verdict.to_json(),
-        "scores": {"before": _scores(tuned.before), "after": _scores(tuned.after)},
-        "data": [_recording(tuned, i) for i in range(len(tuned.prepared.indexes))],
-        "left_out": tuned.prepared.left_out,
-        "warnings": tuned.prepared.warnings,
-        "rigs": _rigs(tuned.prepared.indexes),
+        "weights": {"file": result.weights.name, "sha256": checkpoint.sha256, "step": checkpoint.metadata.get("step")},
+        "started_from": job.started_from,
+        "promoted": result.verdict.promoted,
+        "verdict": result.verdict.to_json(),
+        "scores": {"before": _scores(result.before), "after": _scores(result.after)},
+        "data": [_recording(result, i) for i in range(len(result.prepared.indexes))],
+        "left_out": result.prepared.left_out,
+        "warnings": result.prepared.warnings,
+        "rigs": _rigs(result.prepared.indexes),
         "training": {
             "epochs": trainer.progress.epoch,
             "steps": trainer.progress.step,
@@ -66,7 +67,7 @@ def model_card(tuned: FineTuned) -> dict[str, Any]:
 
 
 def write_card(folder: Path, card: Mapping[str, Any]) -> None:
-    """Write the card for programs and for people."""
+    """Write the card into `folder`, as JSON and as Markdown."""
     write_json(folder / CARD_FILE, dict(card))
     write_atomically(folder / CARD_TEXT_FILE, card_text(card).encode())
 
@@ -76,14 +77,22 @@ def card_text(card: Mapping[str, Any]) -> str:
     return "\n".join([*_head(card), *_score_lines(card["scores"]), *_data_lines(card), *_how_lines(card), ""])
 
 
+def score_pairs(
+    before: Mapping[str, float | None], after: Mapping[str, float | None], arrow: str = "→", unknown: str = "–"
+) -> list[str]:
+    """Return a cell `before → after` for each of `SCORE_TITLES`, of one camera's numbers."""
+    pairs = [(before[name], after.get(name)) for name in SCORE_TITLES]
+    return [f" {arrow} ".join(unknown if number is None else f"{number:.3f}" for number in pair) for pair in pairs]
+
+
 def _scores(result: EvaluationResult | None) -> dict[str, Any] | None:
     if result is None:
         return None
     return {"held_out": nan_to_null(numbers_of(result)), "cameras": camera_numbers(result)}
 
 
-def _recording(tuned: FineTuned, number: int) -> dict[str, Any]:
-    index = tuned.prepared.indexes[number]
+def _recording(result: FinetuneResult, number: int) -> dict[str, Any]:
+    index = result.prepared.indexes[number]
     first, last = (int(stamp) for stamp in index.stamps[[0, -1], index.anchor])
     try:
         files = [list(identity) for identity in file_identities(index.path)]
@@ -96,20 +105,20 @@ def _recording(tuned: FineTuned, number: int) -> dict[str, Any]:
         "seconds": (last - first) / NANOSECONDS,
         "sets": len(index),
         "outside_of_recorded_motion": index.without_motion,
-        "training_samples": tuned.samples[number],
-        "held_out_sets": _scored_sets(tuned, str(index.path)),
+        "training_samples": result.samples[number],
+        "held_out_sets": _scored_sets(result, str(index.path)),
         "cameras": index.layout.names,
     }
 
 
-def _scored_sets(tuned: FineTuned, path: str) -> int:
-    """Count the held-out sets of a recording that both scores rest on: a part that failed proves nothing."""
-    if tuned.before is None or tuned.after is None:
+def _scored_sets(result: FinetuneResult, path: str) -> int:
+    """Return how many held-out sets of a recording were scored before and after; a part that failed proves nothing."""
+    if result.before is None or result.after is None:
         return 0
-    names = {part.job.name for part in tuned.parts if part.job.path == path}
+    names = {part.job.name for part in result.parts if part.job.path == path}
     before, after = (
-        {stamp for table in result.scores.images if table.recording in names for stamp in table.stamps_ns.tolist()}
-        for result in (tuned.before, tuned.after)
+        {stamp for table in found.scores.images if table.recording in names for stamp in table.stamps_ns.tolist()}
+        for found in (result.before, result.after)
     )
     return len(before & after)
 
@@ -153,8 +162,7 @@ def _score_lines(scores: Mapping[str, Any]) -> Iterator[str]:
     yield "| camera | " + " | ".join(SCORE_TITLES.values()) + " |"
     yield "|---|" + "---|" * len(SCORE_TITLES)
     for camera, numbers in before["cameras"].items():
-        cells = [_pair(numbers[name], after["cameras"].get(camera, {}).get(name)) for name in SCORE_TITLES]
-        yield f"| {_plain(camera)} | " + " | ".join(cells) + " |"
+        yield f"| {_plain(camera)} | " + " | ".join(score_pairs(numbers, after["cameras"].get(camera, {}))) + " |"
     yield ""
     yield "Scale is the median of median(truth) / median(prediction), 1 where depth is metric; the photometric error"
     yield "needs no labels. A dash stands for what could not be measured."
@@ -186,10 +194,6 @@ def _how_lines(card: Mapping[str, Any]) -> Iterator[str]:
     yield "```json"
     yield json.dumps(card["configuration"], indent=2)
     yield "```"
-
-
-def _pair(before: float | None, after: float | None) -> str:
-    return " → ".join("–" if number is None else f"{number:.3f}" for number in (before, after))
 
 
 def _plain(value: object) -> str:

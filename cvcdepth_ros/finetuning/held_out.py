@@ -9,19 +9,18 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_core.training.config import TrainingConfig
 from cvcdepth_ros.bags import open_recording
+from cvcdepth_ros.console import progress_bar
 from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings, unique_names
 from cvcdepth_ros.evaluation.result import EvaluationResult
-from cvcdepth_ros.evaluation.workers import KeptParts, evaluate_all
+from cvcdepth_ros.evaluation.workers import KeptScores, evaluate_all
 from cvcdepth_ros.training_data.index import RecordingIndex
 from cvcdepth_ros.training_data.sample_choice import first_held_out
 
-_BAR = "{desc}: {percentage:3.0f}%|{bar}| {n:.1f} of {total} recordings [{elapsed}<{remaining}]"
-_FEWEST_SETS = 2  # the scores along the way need two
+_FEWEST_SETS = 2  # the label-free scores from set to set need two
 
 
 @dataclass(frozen=True)
@@ -29,14 +28,14 @@ class HeldOutPart:
     """The last sets of one recording, which are never trained on."""
 
     job: EvaluationJob
-    """All of it."""
+    """The evaluation of the whole part."""
     recording_start: int
     """Log time of the recording's first message, ns."""
     spans: tuple[tuple[int, int], ...]
     """First and last log time of each set, ns."""
 
-    def between(self, first: int, count: int) -> EvaluationJob:
-        """Return the job that takes `count` sets from the `first` on."""
+    def job_of_sets(self, first: int, count: int) -> EvaluationJob:
+        """Return the job of `count` sets from number `first` of the part on."""
         start, stop = self.spans[first][0], max(last for _, last in self.spans[first : first + count]) + 1
         seconds = (start - self.recording_start) / NANOSECONDS
         return replace(self.job, start=seconds, duration=(stop - start) / NANOSECONDS)
@@ -73,35 +72,34 @@ def _held_out_part(index: RecordingIndex, job: EvaluationJob, config: TrainingCo
         start = recording.start
     spans = tuple((int(times.min()), int(times.max())) for times in log_times)
     part = HeldOutPart(job, start, spans)
-    return replace(part, job=part.between(0, len(spans)))
+    return replace(part, job=part.job_of_sets(0, len(spans)))
 
 
-def some_sets(parts: Sequence[HeldOutPart], most: int) -> list[EvaluationJob]:
-    """Return jobs of `most` sets at most: some consecutive ones in the middle of each part, or of some of the parts."""
+def validation_jobs(parts: Sequence[HeldOutPart], most: int) -> list[EvaluationJob]:
+    """Return jobs of `most` sets in all, or the fewest that can be scored; a run is followed by their scores.
+
+    They are consecutive sets in the middle of each part, or of some of the parts where there are many.
+    """
     chosen = [parts[i] for i in np.unique(np.linspace(0, len(parts) - 1, max(1, most // _FEWEST_SETS)).astype(int))]
     share = max(_FEWEST_SETS, most // len(chosen))
     jobs = []
     for part in chosen:
         count = min(share, len(part.spans))
-        jobs.append(part.between((len(part.spans) - count) // 2, count))
+        jobs.append(part.job_of_sets((len(part.spans) - count) // 2, count))
     return jobs
 
 
-def evaluate(
-    jobs: Sequence[EvaluationJob], checkpoint: Path, folder: Path | None = None, label: str | None = None
+def evaluate_checkpoint(
+    jobs: Sequence[EvaluationJob], checkpoint: Path, folder: Path | None = None, label: str = ""
 ) -> EvaluationResult:
-    """Score a checkpoint file; what `folder` holds of the very same work is not done again.
+    """Return a checkpoint file's scores; those that are kept in `folder` are not measured again.
 
     With a `label` there is a progress bar on terminals. Raises RecordingError when no recording can be evaluated.
     """
     settings = jobs[0].settings.model_copy(update={"checkpoint": str(checkpoint)})
     ready = [replace(job, settings=settings) for job in jobs]
     depends_on = settings.dependencies()
-    kept = None if folder is None else KeptParts(folder, depends_on)
-    with tqdm(total=len(jobs), desc=label, disable=None if label else True, bar_format=_BAR, leave=False) as bar:
-
-        def show(done: float) -> None:
-            bar.update(done - bar.n)
-
+    kept = None if folder is None else KeptScores(folder, depends_on)
+    with progress_bar(len(jobs), "recordings", label=label, quiet=not label, is_kept=False) as show:
         outcomes = [outcome for _, outcome in evaluate_all(ready, kept=kept, progress=show)]
-    return EvaluationResult.of(ready, outcomes, depends_on)
+    return EvaluationResult.from_outcomes(ready, outcomes, depends_on)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Is a checkpoint better than the one it was made from? One number for each, and the proof that they differ."""
+"""The verdict on a checkpoint: whether it is proven to be better than the one that it was trained from."""
 
 from __future__ import annotations
 
@@ -31,20 +31,20 @@ _SHOWN_METRICS = ("abs_rel", "rmse", "delta_1")
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the comparison of before and after says."""
+    """Whether weights are promoted, and why."""
 
     promoted: bool
     reason: str
-    """In words, with the numbers."""
+    """The comparison in words, with the numbers."""
     basis: Basis | None = None
-    """What it was decided by; None where nothing could be compared."""
+    """The measure that decided; None where nothing could be compared."""
     score: str | None = None
     """The name of the number; lower is better."""
     difference: Difference | None = None
     comparison: Comparison | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """Return it with JSON's types."""
+        """Return the verdict with JSON's types."""
         comparison = None
         if self.comparison is not None:
             comparison = {name: value for name, value in asdict(self.comparison).items() if name != "differences"}
@@ -61,7 +61,7 @@ class Verdict:
 
 
 def judge(before: EvaluationResult, after: EvaluationResult) -> Verdict:
-    """Compare two evaluations of the same sets: by the LiDAR's truth where both have any, else without labels."""
+    """Return the verdict on two evaluations of the same sets: by LiDAR where both have truth, else without labels."""
     basis: Basis = "LiDAR" if before.truth_points and after.truth_points else "label-free"
     score = LIDAR_SCORE if basis == "LiDAR" else LABEL_FREE_SCORE
     try:
@@ -91,7 +91,7 @@ def score_of(result: EvaluationResult) -> float:
 
 
 def numbers_of(result: EvaluationResult) -> dict[str, float]:
-    """Return what is worth following over a run; what could not be measured is left out."""
+    """Return the numbers by which a run is followed; those that could not be measured are left out."""
     metrics = result.summary().mean[ALL].metrics
     found = {"score": score_of(result), "sets": float(len(result.sets))}
     found |= {name: metrics[name] for name in _SHOWN_METRICS}
@@ -116,7 +116,7 @@ def photometric(image: ImageScore) -> float:
 
 
 def _not_scored(before: EvaluationResult, after: EvaluationResult) -> str:
-    """Name the recordings whose held-out part the verdict knows nothing of."""
+    """Return the reasons why held-out parts were not scored, to be added to the verdict's; empty without any."""
     reasons = {failure.path: failure.reason for result in (before, after) for failure in result.failed}
     return "".join(f"; not scored: {reason}" for reason in reasons.values())
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What has to be right and known before the first step: checks, indexes, and masks of the vehicle's own body.
+"""The recordings of a run made ready before its first step: checked, indexed, the vehicle's own body masked.
 
-Everything is kept in the run's folder, so that the same command again, and the other processes of a run, find it there.
+All of it is kept in the run's folder, so that the same command again, and the other processes of a run, find it there.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ from cvcdepth_core.files import write_atomically
 from cvcdepth_core.rig.rig_file import RigLayout
 from cvcdepth_ros.bags import Location, file_identities, open_recording
 from cvcdepth_ros.checks import CheckContext, CheckOptions, CheckResult, NumberedResult, run_checks
+from cvcdepth_ros.installation import package_version
+from cvcdepth_ros.kept import Arrays, KeptResults, document_array, read_document
 from cvcdepth_ros.settings import MatchingSettings
 from cvcdepth_ros.training_data.index import RecordingIndex, load_index
 from cvcdepth_ros.training_data.own_body_masks import find_self_occlusion, save_masks
-from cvcdepth_ros.version import package_version
 
 NOT_NEEDED: Collection[str] = ("stamps", "LiDAR")
 """Checks whose failure does not spoil a training: the check of sets tells what odd stamps cost."""
@@ -30,7 +31,7 @@ _CHECKS_FOLDER, _INDEX_FOLDER, _MASKS_FOLDER, _FOUND_FILE = "checks", "index", "
 
 @dataclass(frozen=True)
 class Source:
-    """What to train on."""
+    """The recordings to train on, and how to read them."""
 
     recordings: Sequence[Location]
     layout: RigLayout | None
@@ -45,27 +46,29 @@ class Source:
 
 @dataclass
 class Prepared:
-    """What was found."""
+    """The recordings of a run, ready to be trained on."""
 
     indexes: list[RecordingIndex] = field(default_factory=list)
-    """Of the recordings that can be used, with masks."""
+    """The recordings that can be used, with masks in their rigs."""
     left_out: dict[str, str] = field(default_factory=dict)
-    """Why the others cannot."""
+    """By path: why the others cannot be used."""
     warnings: list[str] = field(default_factory=list)
+    """One line about each loss or doubtful finding."""
     found_masks: dict[str, Path] = field(default_factory=dict)
     """Masks of the vehicle's own body that were found, by a name for each."""
 
 
 def prepare(source: Source, run: Path) -> Prepared:
-    """Check and index the recordings; RecordingError, with every reason, when none can be used."""
+    """Return the recordings, checked, indexed and masked; RecordingError, with every reason, when none can be used."""
     prepared = Prepared()
     for path in source.recordings:
         try:
-            problems = [found for found in checked(path, source, run) if found.result.status in ("failed", "warning")]
+            checks = check_results(path, source, run)
+            problems = [found for found in checks if found.result.status in ("failed", "warning")]
             _refuse(path, problems)
             index = load_index(path, run / _INDEX_FOLDER, source.matching, source.layout)
             prepared.indexes.append(index)
-            prepared.warnings += [_told(path, problem) for problem in problems]
+            prepared.warnings += [_describe_finding(path, problem) for problem in problems]
             prepared.warnings += [f"{path}: {loss}" for loss in index.losses]
         except (CvcDepthError, OSError) as error:
             prepared.left_out[str(path)] = str(error)
@@ -76,46 +79,42 @@ def prepare(source: Source, run: Path) -> Prepared:
     return prepared
 
 
-def checked(path: Location, source: Source, run: Path) -> list[NumberedResult]:
-    """Run the checks of `bag_replay check`, or return what they found before in the very same recording and rig."""
-    matching = source.matching
+def check_results(path: Location, source: Source, run: Path) -> list[NumberedResult]:
+    """Return the results of `cvcdepth check`, found now, or before in the very same recording and rig."""
+    matching, layout = source.matching, source.layout
     options = CheckOptions(tolerance=matching.tolerance, queue_size=matching.queue_size, lidar=source.lidar)
-    layout = source.layout
-    key = {
+    work = {
         "version": package_version(),
         "files": file_identities(path),
         "options": asdict(options),
         "skipped": sorted(source.skipped_checks),
         "rig": None if layout is None else layout.model_dump(mode="json"),
     }
-    kept = run / _CHECKS_FOLDER / f"{path.name}-{_digest(str(path))}.json"
-    found = _read(kept, _digest(json.dumps(key)))
-    if found is None:
+
+    def run_all() -> list[NumberedResult]:
         with open_recording(path) as recording:
-            found = run_checks(CheckContext(recording, options, layout), source.skipped_checks)
-        kept.parent.mkdir(parents=True, exist_ok=True)
-        content = {"key": _digest(json.dumps(key)), "checks": [(n, name, asdict(result)) for n, name, result in found]}
-        write_atomically(kept, json.dumps(content).encode())
-    return found
+            return run_checks(CheckContext(recording, options, layout), source.skipped_checks)
+
+    kept = KeptResults(run / _CHECKS_FOLDER, _checks_to_arrays, _checks_from_arrays)
+    return kept.load_or_make(str(path), work, run_all)
 
 
-def _read(kept: Path, key: str) -> list[NumberedResult] | None:
-    try:
-        content = json.loads(kept.read_text(encoding="utf-8"))
-        if content["key"] != key:
-            return None
-        return [NumberedResult(number, name, CheckResult(**result)) for number, name, result in content["checks"]]
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
+def _checks_to_arrays(checks: list[NumberedResult]) -> Arrays:
+    return {"checks": document_array([(number, name, asdict(result)) for number, name, result in checks])}
+
+
+def _checks_from_arrays(arrays: Arrays) -> list[NumberedResult]:
+    found = read_document(arrays["checks"])
+    return [NumberedResult(number, name, CheckResult(**result)) for number, name, result in found]
 
 
 def _refuse(path: Location, problems: Sequence[NumberedResult]) -> None:
     fatal = [found for found in problems if found.result.status == "failed" and found.name not in NOT_NEEDED]
     if fatal:
-        raise RecordingError("; ".join(_told(path, found) for found in fatal))
+        raise RecordingError("; ".join(_describe_finding(path, found) for found in fatal))
 
 
-def _told(path: Location, found: NumberedResult) -> str:
+def _describe_finding(path: Location, found: NumberedResult) -> str:
     remedy = f" -> {found.result.remedy}" if found.result.remedy else ""
     return f"{path}: check {found.number}, {found.name}: {found.result.finding}{remedy}"
 
@@ -138,7 +137,10 @@ def _add_masks(prepared: Prepared, run: Path) -> None:
 
 
 def _masked(index: RecordingIndex, run: Path) -> RigLayout:
-    """Return the layout with the masks that were found in the recording, now or before."""
+    """Return the layout with the masks that were found in the recording, now or before.
+
+    Pictures, found again by the rig alone: whoever paints over one must not lose it to another version of the program.
+    """
     layout = index.layout
     folder = run / _MASKS_FOLDER / _digest(layout.model_dump_json())
     try:

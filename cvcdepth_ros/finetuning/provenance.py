@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run is made from, in words and hashes: an interrupted run goes on with the same only."""
+"""The inputs of a run, by name and hash: an interrupted run goes on with the same inputs only."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _DIGITS = 12
 
 
 def inputs_of(prepared: Prepared, started_from: str) -> dict[str, str]:
-    """Return start, recordings, rigs and masks by what each is called; a sample is known by its recording's place."""
+    """Return start, recordings, rigs and masks, each by a name; samples are known by their recording's place."""
     found = {"the start": started_from}
     for number, index in enumerate(prepared.indexes, 1):
         found[f"recording {number}"] = f"{index.path.name} ({_sets_digest(index)})"
@@ -23,7 +23,7 @@ def inputs_of(prepared: Prepared, started_from: str) -> dict[str, str]:
 
 
 def _sets_digest(index: RecordingIndex) -> str:
-    """Hash what images are found by; not the path, so that a copy of a recording is the same."""
+    """Return a hash of the stamps by which images are found; not of the path, so that a copy is the same."""
     return _digest(index.stamps.tobytes() + index.log_times.tobytes())
 
 
@@ -33,7 +33,7 @@ def _rig_digest(layout: RigLayout) -> str:
 
 
 def _masks(layout: RigLayout) -> str:
-    """Tell every mask by its content: a PNG may be painted over under the same name."""
+    """Return the cameras' masks with hashes of their content: a PNG may be painted over under the same name."""
     masks = {camera.name: camera.mask for camera in layout.cameras if camera.mask is not None}
     return ", ".join(f"{name} {_digest(mask.read_bytes())}" for name, mask in masks.items()) or "none"
 

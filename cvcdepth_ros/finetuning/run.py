@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A whole fine-tuning: prepare, score the start, train, judge, promote, and leave the evidence beside the weights."""
+"""A whole fine-tuning: prepare, score the start, train, judge, promote."""
 
 from __future__ import annotations
 
@@ -18,27 +18,25 @@ from cvcdepth_core.training.run_folder import CHECKPOINT_FILE
 from cvcdepth_core.training.starting_model import build_surround_model
 from cvcdepth_core.training.trainer import RunObserver, Trainer
 from cvcdepth_ros.evaluation.result import EvaluationResult
-from cvcdepth_ros.finetuning.held_out import HeldOutPart, evaluate, held_out_parts, some_sets
+from cvcdepth_ros.finetuning.held_out import HeldOutPart, evaluate_checkpoint, held_out_parts, validation_jobs
 from cvcdepth_ros.finetuning.judgement import Verdict, judge
 from cvcdepth_ros.finetuning.preparation import Prepared, Source, prepare
 from cvcdepth_ros.finetuning.provenance import inputs_of
 from cvcdepth_ros.finetuning.tensorboard import TensorBoardObserver, has_tensorboard
 from cvcdepth_ros.finetuning.validation import CANDIDATE_FILE, HeldOutValidation
+from cvcdepth_ros.installation import package_version
 from cvcdepth_ros.training_data.loader import RecordingBatches
 from cvcdepth_ros.training_data.sample_choice import describe_skipped_samples
-from cvcdepth_ros.version import package_version
 
 START_FILE, BEST_FILE = "start.safetensors", "best.safetensors"
 
 _START_KEY = "start"
 _SCORES_FOLDER = "scores"
 
-Tell = Callable[[str], None]
-
 
 @dataclass(frozen=True)
-class Order:
-    """What is to be done."""
+class FinetuneJob:
+    """What to train on, how, and from which weights."""
 
     source: Source
     config: TrainingConfig
@@ -51,73 +49,75 @@ class Order:
 
     @property
     def started_from(self) -> str:
-        """What the weights that it starts from are, in words."""
+        """The start's file name and hash, or `random weights`."""
         return "random weights" if self.start is None else f"{self.start.path.name} sha256:{self.start.sha256}"
 
 
 @dataclass(frozen=True, eq=False)
-class FineTuned:
-    """What became of it."""
+class FinetuneResult:
+    """The weights of a finished run, and the evidence for and against them."""
 
-    order: Order
+    job: FinetuneJob
     prepared: Prepared
     trainer: Trainer
     samples: list[int]
     """Training samples of each recording."""
     parts: list[HeldOutPart]
     weights: Path
-    """What was judged: the best file where it was promoted, else the candidate, else the last weights."""
+    """The file that was judged: the best one where it was promoted, else the candidate, else the last weights."""
     before: EvaluationResult | None
-    """Of the whole held-out part; None where nothing is held out."""
+    """The start's scores on the whole held-out part; None where nothing is held out."""
     after: EvaluationResult | None
+    """The weights' scores there."""
     verdict: Verdict
 
 
-def fine_tune(order: Order, processes: Processes, tell: Tell) -> FineTuned | None:
-    """Do all of it; `tell` is called with what is worth a line meanwhile. None in every process but the first.
+def fine_tune(job: FinetuneJob, processes: Processes, warn: Callable[[str], None]) -> FinetuneResult | None:
+    """Train and judge, in one of `processes`; the result is None in every process but the first.
 
-    What a former call in the same folder has finished is not done again.
+    `warn` is called with a line about each loss: recordings, sets and samples that are not trained on. What a former
+    call in the same folder has finished is not done again.
     """
     with processes.first_process_first():
-        prepared = prepare(order.source, order.run)
+        prepared = prepare(job.source, job.run)
     if processes.is_first:
-        _tell_of_losses(prepared, order, tell)
-    batches = RecordingBatches(prepared.indexes, order.config, processes)
-    model = build_surround_model(order.config, order.start)
-    device = own_device(resolve_device(order.device))
+        _warn_of_losses(prepared, job, warn)
+    batches = RecordingBatches(prepared.indexes, job.config, processes)
+    model = build_surround_model(job.config, job.start)
+    device = own_device(resolve_device(job.device))
     parts = []
     if processes.is_first:
-        parts = held_out_parts(prepared.indexes, order.config, str(device), order.source.lidar)
+        parts = held_out_parts(prepared.indexes, job.config, str(device), job.source.lidar)
     if parts:
-        _keep_start(order, model)  # before the trainer fills the model with what a former call reached
-    observers = [TensorBoardObserver(order.run)] if processes.is_first and has_tensorboard() else []
-    trainer = _trainer(order, model, batches, parts, processes, observers, inputs_of(prepared, order.started_from))
+        _keep_start(job, model)  # before the trainer fills the model with what a former call reached
+    observers = [TensorBoardObserver(job.run)] if processes.is_first and has_tensorboard() else []
+    trainer = _trainer(job, model, batches, parts, processes, observers, inputs_of(prepared, job.started_from))
     if processes.is_first and trainer.progress.step == 0:
-        _forget_former_run(order.run)
-    before = _scored(order, parts, order.run / START_FILE, "before") if parts else None
+        _forget_former_run(job.run)
+    before = _evaluated(job, parts, job.run / START_FILE, "before") if parts else None
     try:
-        trainer.train(quiet=order.quiet)
+        trainer.train(quiet=job.quiet)
     finally:
         for observer in observers:
             observer.close()
     if not processes.is_first:
         return None
-    weights, after, verdict = _judged(order, parts, before)
+    weights, after, verdict = _judged(job, parts, before)
     samples = [sum(sample.recording == i for sample in batches.reader.samples) for i in range(len(prepared.indexes))]
-    return FineTuned(order, prepared, trainer, samples, parts, weights, before, after, verdict)
+    return FinetuneResult(job, prepared, trainer, samples, parts, weights, before, after, verdict)
 
 
-def _tell_of_losses(prepared: Prepared, order: Order, tell: Tell) -> None:
-    """Tell what of the recordings is not trained on, and keep it for the report."""
+def _warn_of_losses(prepared: Prepared, job: FinetuneJob, warn: Callable[[str], None]) -> None:
+    """Warn of what is not trained on, and keep the warnings for the report."""
     for index in prepared.indexes:
-        if told := describe_skipped_samples(index, order.config.recordings):
+        if told := describe_skipped_samples(index, job.config.recordings):
             prepared.warnings.append(f"{index.path}: {told}")
     for text in (*(f"left out: {reason}" for reason in prepared.left_out.values()), *prepared.warnings):
-        tell(text)
+        warn(text)
 
 
 def _trainer(
-    order: Order,
+    job: FinetuneJob,
     model: SurroundModel,
     batches: RecordingBatches,
     parts: list[HeldOutPart],
@@ -125,39 +125,40 @@ def _trainer(
     observers: list[TensorBoardObserver],
     inputs: Mapping[str, str],
 ) -> Trainer:
-    config = order.config
+    config = job.config
     watching: list[RunObserver] = [*observers]
     validation = None
     if parts:
-        validation = HeldOutValidation(some_sets(parts, config.evaluation.sets), order.run, config.evaluation.patience)
+        jobs = validation_jobs(parts, config.evaluation.sets)
+        validation = HeldOutValidation(jobs, job.run, config.evaluation.patience)
     return Trainer(
         config,
         model,
         batches,
-        order.run,
-        own_device(resolve_device(order.device)),
+        job.run,
+        own_device(resolve_device(job.device)),
         validation,
-        _metadata(order),
+        _metadata(job),
         watching,
         processes,
         inputs,
     )
 
 
-def _metadata(order: Order) -> dict[str, str]:
-    config = order.config.model_dump_json()
-    return {"version": package_version(), "config": config, _START_KEY: order.started_from}
+def _metadata(job: FinetuneJob) -> dict[str, str]:
+    config = job.config.model_dump_json()
+    return {"version": package_version(), "config": config, _START_KEY: job.started_from}
 
 
-def _keep_start(order: Order, model: SurroundModel) -> None:
-    """Write what the run starts from; CheckpointError when the run in this folder started from other weights."""
-    path = order.run / START_FILE
+def _keep_start(job: FinetuneJob, model: SurroundModel) -> None:
+    """Write the weights that the run starts from; CheckpointError when the folder's run started from others."""
+    path = job.run / START_FILE
     if not path.exists():
         states = (model.depth_net.state_dict(), model.pose_net.state_dict())
-        save_checkpoint(path, order.config.depth, *states, _metadata(order))
+        save_checkpoint(path, job.config.depth, *states, _metadata(job))
     found = load_checkpoint(path).metadata.get(_START_KEY)
-    if found != order.started_from:
-        raise CheckpointError(f"{order.run}: its run started from {found}, now it is {order.started_from}")
+    if found != job.started_from:
+        raise CheckpointError(f"{job.run}: its run started from {found}, now it is {job.started_from}")
 
 
 def _forget_former_run(run: Path) -> None:
@@ -166,28 +167,28 @@ def _forget_former_run(run: Path) -> None:
         (run / name).unlink(missing_ok=True)
 
 
-def _scored(order: Order, parts: list[HeldOutPart], weights: Path, when: str) -> EvaluationResult:
-    label = None if order.quiet else f"held-out part, {when}"
-    return evaluate([part.job for part in parts], weights, order.run / _SCORES_FOLDER / when, label)
+def _evaluated(job: FinetuneJob, parts: list[HeldOutPart], weights: Path, when: str) -> EvaluationResult:
+    label = "" if job.quiet else f"held-out part, {when}"
+    return evaluate_checkpoint([part.job for part in parts], weights, job.run / _SCORES_FOLDER / when, label)
 
 
 def _judged(
-    order: Order, parts: list[HeldOutPart], before: EvaluationResult | None
+    job: FinetuneJob, parts: list[HeldOutPart], before: EvaluationResult | None
 ) -> tuple[Path, EvaluationResult | None, Verdict]:
-    """Score the candidate, compare it with the start, and promote it or not."""
-    run = order.run
+    """Return the judged weights, their scores and the verdict; promoted weights are written as `BEST_FILE`."""
+    run = job.run
     best, candidate = run / BEST_FILE, run / CANDIDATE_FILE
     if before is None:
         reason = "nothing was proven: no recording has a held-out part (recordings.held_out)"
         return run / CHECKPOINT_FILE, None, Verdict(False, reason)
     weights = candidate if candidate.exists() else run / CHECKPOINT_FILE
-    after = _scored(order, parts, weights, "after")
+    after = _evaluated(job, parts, weights, "after")
     verdict = judge(before, after)
     if verdict.promoted:
         write_atomically(best, weights.read_bytes())
         return best, after, verdict
     if best.exists():  # of a former call, with fewer epochs: what it proved stays proven
-        proven = _scored(order, parts, best, "proven")
+        proven = _evaluated(job, parts, best, "proven")
         former = judge(before, proven)
         if former.promoted:
             reason = f"{former.reason}; these are weights of a former call, those of this one are {verdict.reason}"

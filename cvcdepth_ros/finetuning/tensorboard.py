@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Follows a run in TensorBoard: every number of the log, and pictures of what the networks see and say."""
+"""A run in TensorBoard: every number of the log, and pictures of the networks' input and output."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ WITHOUT_TENSORBOARD = "no TensorBoard files: tensorboard is not installed; pip i
 
 
 def has_tensorboard() -> bool:
-    """Say whether TensorBoard files can be written here."""
+    """Return whether TensorBoard files can be written here."""
     return find_spec("tensorboard") is not None
 
 
 class TensorBoardObserver:
-    """Writes a run's numbers and pictures; a run that was interrupted takes back what is made again."""
+    """Writes a run's numbers and pictures; those of steps that an interrupted run repeats are replaced."""
 
     def __init__(self, run: Path) -> None:
         self._folder = run / TENSORBOARD_FOLDER
         self._opened: SummaryWriter | None = None
 
     def on_step(self, trainer: Trainer, entry: Mapping[str, Any]) -> None:
-        """Write the loss, its terms and how the step went."""
+        """Write the loss, its terms, gradient, learning rate and time."""
         writer, step = self._writer(trainer), entry["step"]
         for name in ("loss", "gradient_norm", "learning_rate", "skipped", "seconds"):
             writer.add_scalar(f"training/{name}", entry[name], step)
@@ -41,7 +41,7 @@ class TensorBoardObserver:
             writer.add_scalar(f"terms/{name}", value, step)
 
     def on_pictures(self, trainer: Trainer, batch: RigBatch, prediction: Prediction) -> None:
-        """Write what the step saw and made of it."""
+        """Write the pictures of `training_pictures`."""
         writer = self._writer(trainer)
         for name, picture in training_pictures(batch, prediction, trainer.config.objective).items():
             writer.add_image(name, picture, trainer.progress.step, dataformats="HWC")
@@ -54,7 +54,7 @@ class TensorBoardObserver:
         writer.flush()
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write what is buffered, and close the file."""
         if self._opened is not None:
             self._opened.close()
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a training step sees and makes of it, as pictures: input, depth, rendered views, errors and masks."""
+"""Pictures of a training step: input, depth, rendered views, errors and masks."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What happens while a run is under way: some held-out sets are scored, the best weights kept, and in time it ends."""
+"""The validation of a run: some held-out sets are scored, the best weights kept, and a run without progress ends."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 from cvcdepth_core.training.trainer import Trainer, ValidationOutcome
 from cvcdepth_ros.evaluation.job import EvaluationJob
-from cvcdepth_ros.finetuning.held_out import evaluate
+from cvcdepth_ros.finetuning.held_out import evaluate_checkpoint
 from cvcdepth_ros.finetuning.judgement import numbers_of
 
 CANDIDATE_FILE = "candidate.safetensors"
@@ -19,7 +19,7 @@ _VALIDATED_FILE = ".validated.safetensors"
 
 
 class HeldOutValidation:
-    """Scores the trainer's result on some held-out sets, as the file that would be shipped."""
+    """Scores the trainer's weights on some held-out sets, from the file that would be shipped."""
 
     def __init__(self, jobs: Sequence[EvaluationJob], run: Path, patience: int | None) -> None:
         self._jobs = jobs
@@ -27,10 +27,10 @@ class HeldOutValidation:
         self._patience = patience
 
     def __call__(self, trainer: Trainer) -> ValidationOutcome:
-        """Score, keep the weights if they are the best so far, and say whether it is time to stop."""
+        """Return the scores, and whether to stop; the weights are kept if they are the best so far."""
         path = self._run / _VALIDATED_FILE
         trainer.save_result(path)
-        numbers = numbers_of(evaluate(self._jobs, path))
+        numbers = numbers_of(evaluate_checkpoint(self._jobs, path))
         score = numbers.get("score", math.inf)
         earlier = [(entry["step"], entry["validation"].get("score", math.inf)) for entry in trainer.validations]
         is_start = trainer.progress.step == 0

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ROS 2 node's parts: the only room that imports ROS."""
+"""The parts of the ROS 2 node; other rooms import no ROS."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the node says of itself on `/diagnostics`, in diagnostic_updater's form: `node: subject`, level, values."""
+"""The node's statuses on `/diagnostics`, in diagnostic_updater's form: `node: subject`, level, values."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -26,7 +26,7 @@ _LEVELS = {
 
 
 def status(level: bytes, subject: str, message: str, values: Mapping[str, Any] | None = None) -> DiagnosticStatus:
-    """Build one status; the node's name is put before `subject` when it is published."""
+    """Return one status; the node's name is put before `subject` when it is published."""
     pairs = [KeyValue(key=key, value=_text(value)) for key, value in (values or {}).items()]
     return DiagnosticStatus(level=level, name=subject, message=message, values=pairs)
 
@@ -34,7 +34,7 @@ def status(level: bytes, subject: str, message: str, values: Mapping[str, Any] |
 def camera_status(
     camera: str, condition: CameraCondition, statistics: CameraStatistics, watch: CameraWatch, lost: int
 ) -> DiagnosticStatus:
-    """One camera: its state and why, and how its images fared."""
+    """Return a camera's status: its state, the reason for it, and the counts of its images."""
     silence = watch.seconds_since_image
     values = {
         "state": condition.state.value,
@@ -54,17 +54,17 @@ def camera_status(
 
 
 class SynchronisationStatus:
-    """How many sets were matched, what became of them, and whether any got through since the report before."""
+    """Counts of matched, published and dropped sets, with a warning where none got through since the last status."""
 
     def __init__(self, max_age: float) -> None:
-        """`max_age` in seconds, for the text."""
+        """Name `max_age`, in seconds, in the warning."""
         self._max_age = max_age
         self._before: Counter[str] = Counter()
 
-    def of(
+    def status(
         self, synchroniser: SynchronizerStatistics, mailbox: MailboxStatistics, counters: Mapping[str, int]
     ) -> DiagnosticStatus:
-        """Report what these have counted so far."""
+        """Return the status for these counts."""
         values = {"matched": synchroniser.sets, **asdict(mailbox), **counters}
         problem = self._problem(Counter(values))
         message = f"{synchroniser.sets} sets matched, {counters['published']} published"
@@ -84,7 +84,7 @@ class SynchronisationStatus:
 def inference_status(
     summaries: Mapping[str, StageSummary], mailbox: MailboxStatistics, problem: str, model_id: str
 ) -> DiagnosticStatus:
-    """How long each stage takes, in milliseconds, and how many sets came too late or too early for the network."""
+    """Return the stages' latencies in milliseconds, and the number of sets that never reached the network."""
     values = {
         f"{stage} {name}": value
         for stage, summary in summaries.items()
@@ -95,13 +95,13 @@ def inference_status(
 
 
 def model_status(estimator: DepthEstimator) -> DiagnosticStatus:
-    """Which network runs, and where."""
+    """Return the network's name, its device and the size of its input."""
     values = {"device": estimator.device, "height": estimator.spec.height, "width": estimator.spec.width}
     return status(OK, "model", estimator.model_id, values)
 
 
 def overlap_status(monitor: OverlapMonitor) -> DiagnosticStatus:
-    """How well neighbouring cameras agree, pair by pair, and which of them have changed."""
+    """Return how well neighbouring cameras agree, pair by pair, and which of them have changed."""
     values: dict[str, Any] = {}
     for (camera, neighbour), pair in monitor.pairs().items():
         values[f"{camera} - {neighbour}: turned (deg)"] = pair.misalignment

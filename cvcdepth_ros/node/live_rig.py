@@ -36,7 +36,7 @@ class LiveRigDiscovery:
         self._changed = time.monotonic()
 
     def poll(self) -> RigAssembler | None:
-        """Look at the graph once more; return the rig's assembler when it is complete, its cameras in their order.
+        """Return the rig's assembler, cameras in their order, once the graph has all of it; None before.
 
         Its layout leaves calibrations and poses open, so that they can change later.
         """
@@ -52,11 +52,11 @@ class LiveRigDiscovery:
         return self._assembler
 
     def refuse(self, reason: str) -> None:
-        """Let what was found settle anew, because nothing can be done with it."""
+        """Wait for another rig, since the one that was found cannot be used; `reason` is told until then."""
         self._refusal, self._changed = reason, time.monotonic()
 
     def problem(self) -> str:
-        """Say what is still missing."""
+        """Return what is still missing."""
         if len(self._entries) < self._least:
             names = ", ".join(entry.name for entry in self._entries) or "none"
             want = f"at least {self._least} cameras with image and camera_info topics"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A managed (lifecycle) node that a fault of its own code, or of whoever manages it, does not end."""
+"""A managed (lifecycle) node that survives errors of its own code and impossible requests of its manager."""
 
 import traceback
 from collections.abc import Callable, Iterator
@@ -20,7 +20,7 @@ _INTERRUPTION_SECONDS = 0.1
 
 
 class ManagedNode(LifecycleNode):  # type: ignore[misc] # rclpy is not annotated
-    """rclpy's managed node, with answers where that has none.
+    """rclpy's managed node, which answers and logs what that one does not.
 
     There, the request for a transition that the state does not allow raises in the service's callback, which ends the
     process and leaves the client without an answer; and the reason for a transition's failure is lost.
@@ -32,9 +32,9 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc] # rclpy is not annotated
         self.failure = ""
         """Why the last transition failed; empty when it did not."""
         self.errors = 0
-        """Callbacks that raised what nobody foresaw."""
+        """Callbacks that raised an unforeseen error."""
         self.is_abandoned = False
-        """Whether a thread is still busy that nobody waits for any more."""
+        """Whether a thread is still busy that is no longer waited for."""
         for service in self.services:
             if service.srv_name.endswith("/change_state"):
                 service.callback = partial(self._answer_change_state, service.callback)
@@ -47,14 +47,14 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc] # rclpy is not annotated
 
     @contextmanager
     def survives_errors(self) -> Iterator[None]:
-        """Leave the block at an error, with the error in the log."""
+        """Log an error of the block instead of raising it."""
         try:
             yield
         except Exception as error:
             self.report(error)
 
     def report(self, error: Exception) -> str:
-        """Log and count what nobody foresaw; return it as a reason."""
+        """Log and count an unforeseen error; return its type and message."""
         # A signal invalidates the context at once, and so whatever a callback has just asked rclpy for.
         if self.context.ok():
             self.errors += 1
@@ -62,7 +62,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc] # rclpy is not annotated
         return f"{type(error).__name__}: {error}"
 
     def attempt(self, transition: Callable[[], None]) -> TransitionCallbackReturn:
-        """Make a transition: FAILURE with the reason for the family's errors, error processing for all others."""
+        """Make a transition; the family's errors are a FAILURE with its reason, all others lead to error processing."""
         try:
             transition()
         except CvcDepthError as error:
@@ -76,7 +76,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc] # rclpy is not annotated
         return TransitionCallbackReturn.SUCCESS
 
     def wait_for(self, work: Callable[[], T]) -> T:
-        """Return what `work` returns; as soon as the node is to end, abandon it and raise InterruptedError."""
+        """Return the result of `work`; InterruptedError, and the thread is abandoned, when the node is to end first."""
         pool = ThreadPoolExecutor(1, thread_name_prefix="build")
         future = pool.submit(work)
         pool.shutdown(wait=False)

@@ -41,7 +41,7 @@ _LATENESS_WINDOW = 100_000
 
 @dataclass
 class PlayStatistics:
-    """What was played."""
+    """Counts and delays of what was published."""
 
     published: Counter[str] = field(default_factory=Counter)
     """Messages per topic."""
@@ -133,7 +133,7 @@ class RecordingPlayer:
         self.statistics.published[message.topic] += 1
 
     def _wait_until_acknowledged(self, topic: str, publisher: Publisher) -> None:
-        """Wait a while, and not again for a subscriber that hangs or was killed."""
+        """Wait for subscribers to take large messages, but not again for one that hangs or was killed."""
         if _acknowledged(publisher, 0.0 if topic in self._stalled else _ACKNOWLEDGE_SECONDS):
             self._stalled.discard(topic)
         else:
@@ -141,7 +141,7 @@ class RecordingPlayer:
             self.statistics.unacknowledged[topic] += 1
 
     def _sleep_until(self, due: float, log_time: int, rate: float) -> None:
-        """Sleep, and tell simulated time meanwhile and at the end."""
+        """Sleep until `due`, and publish simulated time meanwhile and at the end."""
         while (remaining := due - time.monotonic()) > 0:
             self._tell_time(log_time - round(remaining * rate * NANOSECONDS))
             time.sleep(min(remaining, _CLOCK_PERIOD))
@@ -155,7 +155,7 @@ class RecordingPlayer:
 
 
 def offered_qos(topic: Topic) -> QoSProfile:
-    """Return what to publish a topic with: as recorded, else reliable with the last 100 messages kept.
+    """Return the QoS to publish a topic with: as recorded, else reliable with the last 100 messages kept.
 
     Of several recorded publishers' profiles the one that satisfies the most subscribers is made. Deadline, lifespan and
     liveliness are left out: at another rate they would be broken. `/tf_static` is always latched.
@@ -173,7 +173,7 @@ def offered_qos(topic: Topic) -> QoSProfile:
 
 
 def _depth(profiles: Sequence[Qos], is_latched: bool) -> int:
-    """Messages to keep; a latched topic had a publisher for each of its transforms, and now has one for all."""
+    """Return how many messages to keep; a latched topic had a publisher for each transform, and now has one for all."""
     recorded = max((p.depth for p in profiles if p.history == QosHistory.KEEP_LAST), default=0)
     return max(recorded, _DEFAULT_DEPTH) if is_latched else recorded or _DEFAULT_DEPTH
 
@@ -188,7 +188,8 @@ def _chosen(recording: Recording, topics: Collection[str] | None, clock: bool) -
 
 
 def _acknowledged(publisher: Publisher, seconds: float) -> bool:
-    """Wait in short turns: a signal is only noticed between them."""
+    """Return whether all messages were acknowledged within `seconds`."""
+    # In short turns: a signal is only noticed between them.
     deadline = time.monotonic() + seconds
     while not publisher.wait_for_all_acked(Duration(seconds=min(max(deadline - time.monotonic(), 0.0), _WAIT_SECONDS))):
         if time.monotonic() >= deadline:

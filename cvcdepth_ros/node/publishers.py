@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node's publishers. What nobody subscribes is not computed."""
+"""The node's publishers; outputs without subscribers are not computed."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -35,7 +35,7 @@ class SurroundOutputs:
             raise
 
     def wanted(self, camera: str) -> bool:
-        """Whether anybody subscribes something for which this camera's depth is needed."""
+        """Return whether a topic is subscribed for which this camera's depth is needed."""
         return any(map(self._has_subscribers, camera_topics(camera)))
 
     def publish(self, estimated: EstimatedSet[Any], frame_ids: Mapping[str, str], limits: CloudLimits) -> None:

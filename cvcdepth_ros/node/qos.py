@@ -17,7 +17,7 @@ _INPUT_DEPTH = 10
 
 
 def input_qos(reliable: bool) -> QoSProfile:
-    """Sensor-data QoS with room for one second of a 10 Hz camera, or the same reliably."""
+    """Return sensor-data QoS with room for one second of a 10 Hz camera, reliable where asked for."""
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
         depth=_INPUT_DEPTH,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What runs while the node is active: its topics tied to the pipeline, and what is known of each camera."""
+"""One active period of the node: its topics connected to the pipeline, and the state of each camera."""
 
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -100,7 +100,7 @@ class SurroundSession:
         self._monitored_rig = None  # what was usual for the former network need not be for this one
 
     def resume_listening(self) -> None:
-        """Hold no silence against the cameras: the executor was busy, and took no image until now."""
+        """Count the cameras' silence from now on: the executor was busy, and took no image until now."""
         for watch in self._watches.values():
             watch.resume_listening()
 
@@ -110,7 +110,7 @@ class SurroundSession:
         return self._is_finished
 
     def conditions(self) -> dict[str, CameraCondition]:
-        """Say for each camera how it fares."""
+        """Return each camera's state and the reason for it."""
         troubles = {name: self._setup_troubles(name) for name in self._watches}
         for name, found in self._inputs.troubles().items():
             troubles[name] += [*found, *self._watches[name].troubles()]
@@ -123,16 +123,16 @@ class SurroundSession:
 
     @property
     def problem(self) -> str:
-        """Why the last set was refused; empty when it was not."""
+        """The reason why the last set was refused; empty when it was not."""
         return self._pipeline.problem
 
     @property
     def refused(self) -> int:
-        """Sets that were refused so far."""
+        """Number of sets that were refused so far."""
         return self._pipeline.counters["refused"]
 
     def diagnostics(self) -> list[DiagnosticStatus]:
-        """Describe cameras, synchronisation, inference and model."""
+        """Return the statuses of cameras, synchronisation, inference, model and overlaps."""
         statistics, mailbox = self._synchroniser.statistics(), self._mailbox.statistics()
         cameras = [
             camera_status(name, found, statistics.cameras[name], self._watches[name], self._inputs.lost[name])
@@ -140,14 +140,14 @@ class SurroundSession:
         ]
         return [
             *cameras,
-            self._synchronisation.of(statistics, mailbox, self._pipeline.counters),
+            self._synchronisation.status(statistics, mailbox, self._pipeline.counters),
             inference_status(self.latencies.summaries(), mailbox, self.problem, self._estimator.model_id),
             model_status(self._estimator),
             *([overlap_status(self._overlaps)] if self._overlaps else []),
         ]
 
     def _setup_troubles(self, camera: str) -> list[Trouble]:
-        """Say what the camera lacks before its images can be used."""
+        """Return what the camera still lacks before its images can be used."""
         assembler, states = self._assembler, CameraState
         reasons = [
             (states.REJECTED, assembler.refusal(camera)),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node's subscriptions: images, camera_info and static transforms, each with what can go wrong on its topic."""
+"""The node's subscriptions (images, camera_info, static transforms), and why nothing arrives on one."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -70,7 +70,7 @@ class CameraInputs:
             camera.connect(types)
 
     def troubles(self) -> dict[str, list[Trouble]]:
-        """Say for each camera why no image can arrive."""
+        """Return for each camera why no image can arrive."""
         types = topic_types(self._node)
         return {name: camera.troubles(types) for name, camera in self._cameras.items()}
 
@@ -111,7 +111,7 @@ class _CameraInput:
                 self._refusal = str(error)
 
     def troubles(self, types: Mapping[str, Sequence[str]]) -> list[Trouble]:
-        """Say why no image can arrive."""
+        """Return why no image can arrive."""
         subscriptions = filter(None, (self._camera_info, self._images))
         mismatches = filter(None, map(self._qos_mismatch, subscriptions))
         return [*self._image_troubles(types), *((CameraState.REJECTED, mismatch) for mismatch in mismatches)]
@@ -132,7 +132,7 @@ class _CameraInput:
         return []
 
     def _qos_mismatch(self, subscription: Subscription) -> str:
-        """Compare with every publisher's QoS in the graph: rclpy's event for it was seen not to come."""
+        """Return how a publisher's QoS does not match; asked of the graph, for rclpy's event was seen not to come."""
         topic = subscription.topic_name
         for publisher in self._node.get_publishers_info_by_topic(topic):
             compatibility, reason = qos_check_compatible(publisher.qos_profile, subscription.qos_profile)
@@ -168,13 +168,13 @@ class StaticTransformInput:
     """Subscribes `/tf_static`. Where tf2_msgs is not installed (the wheels lack it), building it is a ConfigError."""
 
     def __init__(self, node: Node, tree: TransformTree, on_change: Callable[[], None] = lambda: None) -> None:
-        """Add to `tree` all that fits into it, tell the rest in the log, and call `on_change` after each message."""
+        """Add the transforms to `tree`, log those that contradict it, and call `on_change` after each message."""
         try:
             from tf2_msgs.msg import TFMessage
         except ImportError as error:
             raise ConfigError(
                 "the rig file leaves base_T_camera to /tf_static, but tf2_msgs is not installed here; "
-                "write a complete rig file with: bag_replay rig BAG -o rig.yaml"
+                "write a complete rig file with: cvcdepth rig BAG -o rig.yaml"
             ) from error
         self._node, self._tree, self._on_change = node, tree, on_change
         qos = QoSProfile(

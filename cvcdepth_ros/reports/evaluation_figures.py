@@ -1,28 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The diagrams of a report, as PNG; nothing here touches matplotlib's global state."""
+"""The diagrams of an evaluation, as PNG."""
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from cvcdepth_core.scoring.scores import ALL, OVERLAP, Score
 from cvcdepth_ros.evaluation.image_scores import SetScore
 from cvcdepth_ros.evaluation.result import EvaluationResult
+from cvcdepth_ros.reports.style import BLUE, GREEN, LINES, RED, TEXT, YELLOW, add_legend, add_title, dark_figure, to_png
 
-_GROUND, _PANEL, TEXT, LINES = "#121418", "#1c1f25", "#ebeef2", "#3e444e"
-BLUE, YELLOW, RED, GREEN = "#4fb3ff", "#ffc440", "#ff7a8a", "#79e08f"
-_DPI = 130
 _NAMED_RECORDINGS = 12
 
 
 def error_by_range(result: EvaluationResult) -> bytes:
-    """Abs Rel by range of the true depth."""
+    """Draw Abs Rel by range of the true depth."""
     groups = [ALL, *result.scores.settings.range_names, OVERLAP]
     labels = ["all", *(f"{name} m" for name in result.scores.settings.range_names), "overlaps"]
     means = [result.summary(scaling=scaling).mean for scaling in ("metric", "median")]
@@ -30,14 +26,14 @@ def error_by_range(result: EvaluationResult) -> bytes:
 
 
 def error_by_camera(result: EvaluationResult) -> bytes:
-    """Abs Rel by camera."""
+    """Draw Abs Rel by camera."""
     cameras = [result.summary(scaling=scaling).cameras for scaling in ("metric", "median")]
     scores = [_of_all(found) for found in cameras]
     return _paired_bars("Abs Rel by camera", result.scores.cameras, *scores)
 
 
 def time_series(sets: Sequence[SetScore]) -> bytes:
-    """Abs Rel and the label-free scores, set after set, recording after recording."""
+    """Draw Abs Rel and the label-free scores, set after set, recording after recording."""
     figure, (errors, disagreement) = dark_figure(13, 5.2, rows=2)
     numbers = np.arange(len(sets))
     starts = [i for i in range(len(sets)) if i == 0 or sets[i].recording != sets[i - 1].recording]
@@ -45,7 +41,7 @@ def time_series(sets: Sequence[SetScore]) -> bytes:
     _line(disagreement, numbers, starts, [s.label_free.spatial for s in sets], RED, "between cameras")
     _line(disagreement, numbers, starts, [s.label_free.temporal for s in sets], GREEN, "along the way")
     for axes, title in ((errors, "Abs Rel"), (disagreement, "median relative disagreement, label-free")):
-        axes.set_title(title, loc="left", color=TEXT, fontsize=11)
+        add_title(axes, title)
         axes.set_xlim(-0.5, max(len(sets) - 0.5, 0.5))
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.set_ylim(0, 1.2 * axes.dataLim.ymax if axes.has_data() else 1)
@@ -58,13 +54,13 @@ def time_series(sets: Sequence[SetScore]) -> bytes:
 
 
 def label_free_against_error(sets: Sequence[SetScore]) -> bytes:
-    """Each set's label-free scores against its Abs Rel."""
+    """Draw each set's label-free scores against its Abs Rel."""
     figure, (axes,) = dark_figure(6.4, 3.4)
     for name, colour, label in (("spatial", RED, "between cameras"), ("temporal", GREEN, "along the way")):
         known = [s for s in sets if not np.isnan(s.abs_rel + getattr(s.label_free, name))]
         x, y = [getattr(s.label_free, name) for s in known], [s.abs_rel for s in known]
         axes.scatter(x, y, s=14, color=colour, label=label)
-    axes.set_title("Abs Rel over disagreement, a dot per set", loc="left", color=TEXT, fontsize=11)
+    add_title(axes, "Abs Rel over disagreement, a dot per set")
     axes.set_xlabel("median relative disagreement", color=TEXT)
     axes.set_ylabel("Abs Rel", color=TEXT)
     axes.margins(0.1)
@@ -84,7 +80,7 @@ def _paired_bars(title: str, labels: Sequence[str], predicted: Sequence[Score], 
         texts = ["" if np.isnan(height) else f"{height:.2f}" for height in heights]
         axes.bar_label(bars, texts, color=TEXT, fontsize=7, padding=1)
     axes.set_xticks(places, labels, rotation=20 if len(labels) > 4 else 0, ha="right" if len(labels) > 4 else "center")
-    axes.set_title(title, loc="left", color=TEXT, fontsize=11)
+    add_title(axes, title)
     axes.margins(y=0.15)
     add_legend(axes)
     return to_png(figure)
@@ -118,29 +114,3 @@ def _name_recordings(axes: Axes, sets: Sequence[SetScore], starts: Sequence[int]
 
 def _of_all(cameras: Mapping[str, Mapping[str, Score]]) -> list[Score]:
     return [scores[ALL] for scores in cameras.values()]
-
-
-def dark_figure(width: float, height: float, rows: int = 1) -> tuple[Figure, list[Axes]]:
-    """Return a figure of `width` x `height` inches in the pages' colours, with axes one below the other."""
-    figure = Figure((width, height), dpi=_DPI, facecolor=_GROUND, layout="constrained")
-    all_axes = [figure.add_subplot(rows, 1, row + 1, facecolor=_PANEL) for row in range(rows)]
-    for axes in all_axes:
-        axes.tick_params(colors=TEXT, labelsize=8)
-        axes.grid(axis="y", color=LINES, linewidth=0.6)
-        axes.set_axisbelow(True)
-        for spine in axes.spines.values():
-            spine.set_color(LINES)
-    return figure, all_axes
-
-
-def add_legend(axes: Axes) -> None:
-    """Name what is drawn, where it has names."""
-    if axes.get_legend_handles_labels()[0]:
-        axes.legend(fontsize=8, facecolor=_PANEL, edgecolor=LINES, labelcolor=TEXT)
-
-
-def to_png(figure: Figure) -> bytes:
-    """Return the figure as a file."""
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png")
-    return stream.getvalue()

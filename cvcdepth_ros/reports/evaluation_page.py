@@ -1,19 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page: what is chosen to be seen, and everything that the template puts into its places."""
+"""`report.html` of an evaluation: tables, diagrams, and the best, the median and the worst set."""
 
 from __future__ import annotations
 
-import base64
 import json
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import jinja2
 import numpy as np
 
-from cvcdepth_core.errors import CvcDepthError
 from cvcdepth_core.files import write_atomically
 from cvcdepth_core.scoring.consistency import summarise_agreement
 from cvcdepth_core.scoring.metrics import METRIC_NAMES
@@ -24,7 +20,9 @@ from cvcdepth_ros.evaluation.job import EvaluationJob
 from cvcdepth_ros.evaluation.measuring import Remeasuring
 from cvcdepth_ros.evaluation.result import PROTOCOLS, EvaluationResult
 from cvcdepth_ros.reports import evaluation_figures as figures
-from cvcdepth_ros.reports.evaluation_pictures import GREATEST_ERROR, SetPictures, draw_set, error_colours
+from cvcdepth_ros.reports.evaluation_pictures import GREATEST_ERROR, error_colours
+from cvcdepth_ros.reports.shown_sets import ShownSet, chosen_sets, drawn_again, shown_set
+from cvcdepth_ros.reports.style import render_page
 
 _LEGEND_STEPS = 24
 _METRIC_TITLES = dict(
@@ -38,16 +36,6 @@ _LABEL_FREE_TITLES = {
 }
 
 
-class ShownSet(NamedTuple):
-    """A set that the report shows."""
-
-    title: str
-    score: SetScore
-    pictures: SetPictures | None
-    problem: str
-    """Why there are no pictures."""
-
-
 def write_report(path: Path, result: EvaluationResult, jobs: Mapping[str, EvaluationJob]) -> None:
     """Write the page; the jobs, by recording, are there to measure the sets again that it shows."""
     chosen = chosen_sets(result.sets)
@@ -56,61 +44,33 @@ def write_report(path: Path, result: EvaluationResult, jobs: Mapping[str, Evalua
     write_atomically(path, render(result, shown).encode())
 
 
-def chosen_sets(sets: Sequence[SetScore]) -> list[tuple[str, SetScore]]:
-    """Return the best, the median and the worst set, each once; nothing where no set has any score.
-
-    Where some sets have truth, it is they that are ranked: an error and a disagreement cannot be compared.
-    """
-    with_truth = [found for found in sets if not math.isnan(found.abs_rel)]
-    ranked = sorted((f for f in with_truth or sets if not math.isnan(f.rank)), key=lambda found: found.rank)
-    places = {"Best set": 0, "Median set": (len(ranked) - 1) // 2, "Worst set": len(ranked) - 1}
-    by_place = {place: title for title, place in places.items()}
-    return [(title, ranked[place]) for place, title in sorted(by_place.items()) if 0 <= place < len(ranked)]
-
-
 def render(result: EvaluationResult, shown: Sequence[ShownSet]) -> str:
-    """Return the page; whatever comes from files is escaped by the template engine."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader(__package__), autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
-    )
-    environment.filters |= {"number": to_number, "data_url": to_data_url}
-    return environment.get_template("report.html").render(
-        result=result,
-        shown=shown,
-        lidar_set=_with_most_tiles(shown),
-        metric_titles=_METRIC_TITLES,
-        label_free_titles=_LABEL_FREE_TITLES,
-        score_tables=_score_tables(result),
-        groups=_group_titles(result),
-        agreement=summarise_agreement(result.agreement),
-        correlations=correlations(result.sets),
-        figures=_figures(result),
-        error_legend=_error_legend(),
-        depth_legend=_depth_legend(result),
-        configuration=json.dumps(result.configuration, indent=2),
-    )
+    """Return the page as HTML."""
+    content = {
+        "result": result,
+        "shown": shown,
+        "lidar_set": _with_most_tiles(shown),
+        "metric_titles": _METRIC_TITLES,
+        "label_free_titles": _LABEL_FREE_TITLES,
+        "score_tables": _score_tables(result),
+        "groups": _group_titles(result),
+        "agreement": summarise_agreement(result.agreement),
+        "correlations": correlations(result.sets),
+        "figures": _figures(result),
+        "error_legend": _error_legend(),
+        "depth_legend": _depth_legend(result),
+        "configuration": json.dumps(result.configuration, indent=2),
+    }
+    return render_page("evaluation.html", content)
 
 
 def _shown(title: str, score: SetScore, result: EvaluationResult, job: EvaluationJob, again: Remeasuring) -> ShownSet:
-    try:
-        pictures = drawn_again(title, score, result, job, again)
-    except (CvcDepthError, OSError) as error:
-        return ShownSet(title, score, None, str(error))
-    return ShownSet(title, score, pictures, "")
-
-
-def drawn_again(
-    title: str, score: SetScore, result: EvaluationResult, job: EvaluationJob, again: Remeasuring
-) -> SetPictures:
-    """Measure a set of a result once more, for its pictures; the errors of the family say why that is not possible."""
-    recording = next(found for found in result.recordings if found.name == score.recording)
-    measured = again.measured_set(job, score.stamp_ns, int(recording.log_times[score.number]))
-    return draw_set(measured, f"{title}: {score.recording}", job.settings.max_depth)
+    return shown_set(title, [score], lambda: [drawn_again(title, score, result, job, again)])
 
 
 def _with_most_tiles(shown: Sequence[ShownSet]) -> ShownSet | None:
     """Return the set whose LiDAR is shown in the cameras: the one in the middle that has any."""
-    found = [one for one in shown if one.pictures and one.pictures.lidar]
+    found = [one for one in shown if one.pictures and one.pictures[0].lidar]
     return found[len(found) // 2] if found else None
 
 
@@ -158,13 +118,3 @@ def _depth_legend(result: EvaluationResult) -> dict[str, Any]:
 
 def _css(colours: np.ndarray) -> str:
     return ", ".join("rgb({}, {}, {})".format(*colour) for colour in colours.tolist())
-
-
-def to_number(value: float, digits: int = 3) -> str:
-    """Return a number as pages show it; a dash for NaN."""
-    return "–" if math.isnan(value) else f"{value:.{digits}f}"
-
-
-def to_data_url(content: bytes, kind: str) -> str:
-    """Return a picture of this kind (png, jpeg) as an address that holds it."""
-    return f"data:image/{kind};base64,{base64.b64encode(content).decode('ascii')}"

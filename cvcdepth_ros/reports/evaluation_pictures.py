@@ -26,13 +26,13 @@ from cvcdepth_core.visualization import (
 )
 from cvcdepth_ros.evaluation.measuring import MeasuredSet
 from cvcdepth_ros.messages.conversion import picture_from_message
+from cvcdepth_ros.reports.style import to_jpeg
 
 GREATEST_ERROR = 0.5
 """Relative error at which the colours of error maps end."""
 
 _TILE_WIDTH = 800
 _DOT_RADIUS = 2
-_JPEG_QUALITY = 85
 _DIMMED = 0.6
 _CLOUD = CloudLimits(stride=2, min_range=0.5)
 
@@ -72,7 +72,7 @@ def draw_set(measured: MeasuredSet, title: str, far: float) -> SetPictures:
         title,
         [f"Right: the scene from above, grid 10 m; estimated points in their own colours{_lidar_note(measured)}"],
     )
-    sheet = _jpeg(contact_sheet(estimated.rig, shown, scale))
+    sheet = to_jpeg(contact_sheet(estimated.rig, shown, scale))
     if not any(len(truth) for truth in measured.truth):
         return SetPictures(sheet, [], [])
     return SetPictures(
@@ -103,7 +103,7 @@ def _tiles(measured: MeasuredSet, colours: Callable[[SparseDepth, NDArray[np.flo
             picture = _dimmed(_rectified(measured, rig.cameras[index]))
             truth = measured.truth[index]
             _dot(picture, truth, colours(truth, depth[index]))
-            tiles.append(Tile(rig.names[index], _jpeg(picture), picture.shape[1], picture.shape[0]))
+            tiles.append(Tile(rig.names[index], to_jpeg(picture), picture.shape[1], picture.shape[0]))
         rows.append(tiles)
     return rows
 
@@ -140,9 +140,3 @@ def _unpacked_rgb(packed: NDArray[np.float32]) -> Colours:
 
 def _lidar_note(measured: MeasuredSet) -> str:
     return ", LiDAR in cyan" if measured.lidar is not None else ", no LiDAR"
-
-
-def _jpeg(picture: Picture) -> bytes:
-    options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
-    _, encoded = cv2.imencode(".jpg", np.ascontiguousarray(picture[..., ::-1]), options)
-    return bytes(encoded)

@@ -7,12 +7,10 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
-import jinja2
 
-from cvcdepth_core.errors import CvcDepthError
 from cvcdepth_core.files import write_atomically
 from cvcdepth_core.training.run_folder import LOG_FILE
 from cvcdepth_ros.evaluation.image_scores import SetScore
@@ -20,75 +18,60 @@ from cvcdepth_ros.evaluation.job import EvaluationJob
 from cvcdepth_ros.evaluation.measuring import Remeasuring
 from cvcdepth_ros.evaluation.result import EvaluationResult
 from cvcdepth_ros.finetuning.card import SCORE_TITLES
-from cvcdepth_ros.finetuning.run import START_FILE, FineTuned
-from cvcdepth_ros.reports.evaluation_page import chosen_sets, drawn_again, to_data_url, to_number
+from cvcdepth_ros.finetuning.run import START_FILE, FinetuneResult
 from cvcdepth_ros.reports.evaluation_pictures import SetPictures
 from cvcdepth_ros.reports.learning_curves import RunLog, held_out_curves, loss_curves
-
-REPORT_FILE = "report.html"
+from cvcdepth_ros.reports.shown_sets import ShownSet, chosen_sets, drawn_again, shown_set
+from cvcdepth_ros.reports.style import render_page, to_png
 
 _MASK_WIDTH = 480
 
 
-class ShownSet(NamedTuple):
-    """A held-out set, before and after."""
-
-    title: str
-    before: SetScore
-    after: SetScore
-    pictures: tuple[SetPictures, SetPictures] | None
-    problem: str
-    """Why there are no pictures."""
-
-
-def write_report(path: Path, tuned: FineTuned, card: Mapping[str, Any]) -> None:
+def write_report(path: Path, result: FinetuneResult, card: Mapping[str, Any]) -> None:
     """Write the page."""
-    log = RunLog.read(tuned.order.run / LOG_FILE)
-    write_atomically(path, render(card, _shown_sets(tuned), log, _masks(tuned)).encode())
+    log = RunLog.read(result.job.run / LOG_FILE)
+    write_atomically(path, render(card, _shown_sets(result), log, _masks(result)).encode())
 
 
 def render(card: Mapping[str, Any], shown: Sequence[ShownSet], log: RunLog, masks: Mapping[str, bytes]) -> str:
-    """Return the page; whatever comes from files is escaped by the template engine. `masks` are PNGs by name."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader(__package__), autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
-    )
-    environment.filters |= {"number": _number, "data_url": to_data_url}
-    return environment.get_template("run.html").render(
-        card=card,
-        shown=shown,
-        masks=masks,
-        score_titles=SCORE_TITLES,
-        curves=loss_curves(log) if log.steps else None,
-        held_out=held_out_curves(log) if log.validations else None,
-        configuration=json.dumps(card["configuration"], indent=2),
-    )
+    """Return the page as HTML; `masks` are PNG files by name."""
+    content = {
+        "card": card,
+        "shown": shown,
+        "masks": masks,
+        "score_titles": SCORE_TITLES,
+        "curves": to_png(loss_curves(log)) if log.steps else None,
+        "held_out": to_png(held_out_curves(log)) if log.validations else None,
+        "configuration": json.dumps(card["configuration"], indent=2),
+    }
+    return render_page("finetuning.html", content)
 
 
-def _shown_sets(tuned: FineTuned) -> list[ShownSet]:
-    """Return the sets that are best, median and worst afterwards."""
-    if tuned.before is None or tuned.after is None:
+def _shown_sets(result: FinetuneResult) -> list[ShownSet]:
+    """Return the sets that are best, median and worst afterwards, as the start and the new weights see them."""
+    before, after = result.before, result.after
+    if before is None or after is None:
         return []
-    earlier = {(found.recording, found.stamp_ns): found for found in tuned.before.sets}
-    jobs = {part.job.name: part.job for part in tuned.parts}
+    earlier = {(found.recording, found.stamp_ns): found for found in before.sets}
+    jobs = {part.job.name: part.job for part in result.parts}
+    networks = (("before", result.job.run / START_FILE, before), ("after", result.weights, after))
     return [
-        _shown(title, earlier[after.recording, after.stamp_ns], after, tuned, jobs[after.recording])
-        for title, after in chosen_sets(tuned.after.sets)
-        if (after.recording, after.stamp_ns) in earlier
+        _shown(title, [earlier[score.recording, score.stamp_ns], score], jobs[score.recording], networks)
+        for title, score in chosen_sets(after.sets)
+        if (score.recording, score.stamp_ns) in earlier
     ]
 
 
-def _shown(title: str, before: SetScore, after: SetScore, tuned: FineTuned, job: EvaluationJob) -> ShownSet:
-    try:
-        results = (
-            ("before", tuned.order.run / START_FILE, tuned.before, before),
-            ("after", tuned.weights, tuned.after, after),
-        )
-        drawn = [
-            _drawn(f"{title}, {when}", job, weights, result, set_) for when, weights, result, set_ in results if result
+def _shown(
+    title: str, scores: Sequence[SetScore], job: EvaluationJob, networks: Sequence[tuple[str, Path, EvaluationResult]]
+) -> ShownSet:
+    def draw() -> list[SetPictures]:
+        return [
+            _drawn(f"{title}, {when}", job, weights, result, score)
+            for (when, weights, result), score in zip(networks, scores, strict=True)
         ]
-    except (CvcDepthError, OSError) as error:
-        return ShownSet(title, before, after, None, str(error))
-    return ShownSet(title, before, after, (drawn[0], drawn[1]), "")
+
+    return shown_set(title, scores, draw)
 
 
 def _drawn(title: str, job: EvaluationJob, weights: Path, result: EvaluationResult, score: SetScore) -> SetPictures:
@@ -97,17 +80,13 @@ def _drawn(title: str, job: EvaluationJob, weights: Path, result: EvaluationResu
         return drawn_again(title, score, result, replace(job, settings=settings), again)
 
 
-def _masks(tuned: FineTuned) -> dict[str, bytes]:
+def _masks(result: FinetuneResult) -> dict[str, bytes]:
     """Return the masks that were found, small."""
     found = {}
-    for name, path in tuned.prepared.found_masks.items():
+    for name, path in result.prepared.found_masks.items():
         mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         if mask is not None:
             height = round(_MASK_WIDTH * mask.shape[0] / mask.shape[1])
             small = cv2.resize(mask, (_MASK_WIDTH, height), interpolation=cv2.INTER_AREA)
             found[name] = cv2.imencode(".png", small)[1].tobytes()
     return found
-
-
-def _number(value: float | None, digits: int = 3) -> str:
-    return to_number(float("nan") if value is None else value, digits)

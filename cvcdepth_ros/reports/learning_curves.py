@@ -10,54 +10,64 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-from cvcdepth_ros.reports.evaluation_figures import BLUE, GREEN, RED, TEXT, YELLOW, add_legend, dark_figure, to_png
+from cvcdepth_ros.reports.style import (
+    BLUE,
+    GREEN,
+    RED,
+    TEXT,
+    YELLOW,
+    add_legend,
+    add_title,
+    dark_figure,
+    series_colours,
+)
 
 _SMOOTHED_OVER = 50  # parts of the run: a point of the curve is the mean of one
-_COLOURS = (YELLOW, RED, GREEN, "#c792ea", "#f78c6c", "#89ddff", "#b0bec5")
 
 
 class RunLog(NamedTuple):
-    """What a run has written down."""
+    """The entries of a run's log."""
 
     steps: list[dict[str, Any]]
     validations: list[dict[str, Any]]
 
     @classmethod
     def read(cls, path: Path) -> RunLog:
-        """Read `log.jsonl`; nothing where there is none."""
+        """Read `log.jsonl`; a log without entries where there is no file."""
         lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
         entries = [json.loads(line) for line in lines]
         return cls([e for e in entries if "loss" in e], [e for e in entries if "validation" in e])
 
 
-def loss_curves(log: RunLog) -> bytes:
-    """Draw the loss and its unweighted terms over the steps, as PNG."""
+def loss_curves(log: RunLog) -> Figure:
+    """Draw the loss and each of its unweighted terms over the steps."""
     figure, (loss, terms) = dark_figure(13, 5.2, rows=2)
     _curve(loss, log.steps, lambda entry: float(entry["loss"]), BLUE, "loss")
     names = dict.fromkeys(name for entry in log.steps for name in entry["terms"])
-    for name, colour in zip(names, _COLOURS, strict=False):
+    for name, colour in zip(names, series_colours(len(names)), strict=True):
         _curve(terms, log.steps, _term(name), colour, name)
     terms.set_yscale("log")
     terms.tick_params(which="both", colors=TEXT)
-    _title(loss, "loss")
-    _title(terms, "its terms, without their weights")
+    add_title(loss, "loss")
+    add_title(terms, "its terms, without their weights")
     add_legend(terms)
     terms.set_xlabel("step", color=TEXT)
-    return to_png(figure)
+    return figure
 
 
-def held_out_curves(log: RunLog) -> bytes:
-    """Draw the scores of the validations over the steps, as PNG."""
+def held_out_curves(log: RunLog) -> Figure:
+    """Draw the scores of the validations over the steps."""
     figure, (score, others) = dark_figure(13, 5.2, rows=2)
     _points(score, log.validations, "score", BLUE)
     for name, colour in (("spatial_photometric", YELLOW), ("temporal_photometric", GREEN), ("spatial", RED)):
         _points(others, log.validations, name, colour)
-    _title(score, "score that weights are chosen by, on some held-out sets (lower is better)")
-    _title(others, "label-free scores")
+    add_title(score, "score that weights are chosen by, on some held-out sets (lower is better)")
+    add_title(others, "label-free scores")
     add_legend(others)
     others.set_xlabel("step", color=TEXT)
-    return to_png(figure)
+    return figure
 
 
 def _term(name: str) -> Callable[[Mapping[str, Any]], float]:
@@ -88,7 +98,3 @@ def _points(axes: Axes, entries: Sequence[Mapping[str, Any]], name: str, colour:
     known = [(entry["step"], entry["validation"][name]) for entry in entries if name in entry["validation"]]
     if known:
         axes.plot(*zip(*known, strict=True), color=colour, linewidth=1.4, marker="o", markersize=4, label=name)
-
-
-def _title(axes: Axes, text: str) -> None:
-    axes.set_title(text, loc="left", color=TEXT, fontsize=11)

@@ -6,12 +6,9 @@ An index is built in one pass and kept beside the run; it is built anew when a f
 
 from __future__ import annotations
 
-import hashlib
-import io
-import json
-import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvcdepth_core.errors import ImageError, RecordingError, RigError, TransformError
-from cvcdepth_core.files import write_atomically
 from cvcdepth_core.rig.rig_file import RigLayout
 from cvcdepth_core.stamps import exposure_times
 from cvcdepth_ros.bags import Location, Recording, file_identities, open_recording
+from cvcdepth_ros.kept import Arrays, KeptResults, Work, document_array, read_document
 from cvcdepth_ros.messages.conversion import picture_from_message
 from cvcdepth_ros.recordings.motion import VehicleMotion
 from cvcdepth_ros.recordings.refusals import Refusals
@@ -33,7 +30,7 @@ from cvcdepth_ros.recordings.truth import RecordedTruth
 from cvcdepth_ros.settings import MatchingSettings
 from cvcdepth_ros.surround_sets.synchronizer import SurroundSet
 
-_FORMAT = 2
+_FORMAT = 3
 _THUMBNAIL = (40, 24)
 
 
@@ -86,14 +83,10 @@ def load_index(
     `rig_layout` names cameras and what the recording lacks; without it the cameras are found. Raises
     RecordingError, RigError or TransformError, naming the recording, when it has no sets or no complete rig.
     """
-    key = _key(path, matching, rig_layout)
-    cached = directory / f"{path.name}-{hashlib.sha256(str(path).encode()).hexdigest()[:8]}.npz"
-    index = _read(cached, path, key)
-    if index is None:
-        index = build_index(path, matching, rig_layout)
-        directory.mkdir(parents=True, exist_ok=True)
-        _write(cached, index, key)
-    return index
+    kept = KeptResults(directory, _to_arrays, partial(_from_arrays, path))
+    return kept.load_or_make(
+        str(path), _work(path, matching, rig_layout), lambda: build_index(path, matching, rig_layout)
+    )
 
 
 def build_index(path: Location, matching: MatchingSettings, rig_layout: RigLayout | None = None) -> RecordingIndex:
@@ -146,7 +139,7 @@ def _refuse_lonely_cameras(recorded: RecordedRig) -> None:
     if lonely:
         raise RigError(
             f"{recorded.recording.path}: camera {', '.join(lonely)}: shares no view with another camera, so there is "
-            "no overlap to learn metric depth from; `bag_replay rig` shows the overlaps"
+            "no overlap to learn metric depth from; `cvcdepth rig` shows the overlaps"
         )
 
 
@@ -199,47 +192,36 @@ def _table(sets: list[SurroundSet[int]], kept: list[int], row: Any) -> NDArray[n
     return np.array([row(sets[i]) for i in kept], dtype=np.int64).reshape(len(kept), -1)
 
 
-def _key(path: Location, matching: MatchingSettings, layout: RigLayout | None) -> str:
-    """Everything that an index depends on."""
-    return json.dumps(
-        {
-            "format": _FORMAT,
-            "files": file_identities(path),
-            "matching": matching.model_dump(),
-            "rig": None if layout is None else layout.model_dump(mode="json"),
-        }
-    )
+def _work(path: Location, matching: MatchingSettings, layout: RigLayout | None) -> Work:
+    """Return everything that an index depends on."""
+    return {
+        "format": _FORMAT,
+        "files": file_identities(path),
+        "matching": matching.model_dump(),
+        "rig": None if layout is None else layout.model_dump(mode="json"),
+    }
 
 
-def _write(cached: Path, index: RecordingIndex, key: str) -> None:
+def _to_arrays(index: RecordingIndex) -> Arrays:
+    described = {
+        "layout": index.layout.model_dump_json(),
+        "without_motion": index.without_motion,
+        "unread": index.unread,
+    }
     arrays = {name: getattr(index, name) for name in ("stamps", "log_times", "poses", "thumbnails")}
-    content = io.BytesIO()
-    np.savez_compressed(
-        content,
-        key=np.array(key),
-        layout=np.array(index.layout.model_dump_json()),
-        unplaced=np.array(index.without_motion),
-        unread=np.array(json.dumps(index.unread)),
-        **{name: array for name, array in arrays.items() if array is not None},
+    known = {name: array for name, array in arrays.items() if array is not None}
+    return {"described": document_array(described), **known}
+
+
+def _from_arrays(path: Location, arrays: Arrays) -> RecordingIndex:
+    described = read_document(arrays["described"])
+    return RecordingIndex(
+        path,
+        RigLayout.model_validate_json(described["layout"]),
+        arrays["stamps"],
+        arrays["log_times"],
+        arrays.get("poses"),
+        arrays.get("thumbnails"),
+        described["without_motion"],
+        tuple(described["unread"]),
     )
-    write_atomically(cached, content.getvalue())
-
-
-def _read(cached: Path, path: Location, key: str) -> RecordingIndex | None:
-    """Return what is kept in `cached` if it was built with the same `key`; None also when it cannot be read."""
-    try:
-        with np.load(cached, allow_pickle=False) as kept:
-            if str(kept["key"]) != key:
-                return None
-            return RecordingIndex(
-                path,
-                RigLayout.model_validate_json(str(kept["layout"])),
-                kept["stamps"],
-                kept["log_times"],
-                kept.get("poses"),
-                kept.get("thumbnails"),
-                int(kept["unplaced"]),
-                tuple(json.loads(str(kept["unread"]))),
-            )
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile):
-        return None

@@ -8,7 +8,7 @@ from recordings import SAMPLE
 from cvcdepth_core.pointcloud import CloudLimits, merged_cloud, organised_cloud, pack_rgb, thinned
 from cvcdepth_core.surround_depth import SurroundDepth
 from cvcdepth_ros.bags import open_recording
-from cvcdepth_ros.bench.straightforward import straightforward_cloud
+from cvcdepth_ros.bench.baseline_cloud import baseline_cloud
 from cvcdepth_ros.recordings.rig import discover_rig
 
 HEIGHT, WIDTH = 100, 150  # no whole number of blocks
@@ -67,7 +67,7 @@ def test_the_merged_cloud_has_every_known_point_inside_the_limits_in_the_base_fr
 
 def test_the_benchmarks_baseline_makes_the_same_cloud(surround, rig):
     limits = CloudLimits(2, 2.0, 50.0)
-    ours, theirs = merged_cloud(surround, rig, limits), straightforward_cloud(surround, rig, limits)
+    ours, theirs = merged_cloud(surround, rig, limits), baseline_cloud(surround, rig, limits)
     np.testing.assert_allclose(ours[:, :3], theirs[:, :3], rtol=1e-4, atol=1e-3)
     np.testing.assert_array_equal(ours[:, 3].view(np.uint32), theirs[:, 3].view(np.uint32))
 

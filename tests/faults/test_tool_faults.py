@@ -476,9 +476,7 @@ def test_the_tool_meets_the_fault_with_one_line_or_a_result_that_tells_it(
     assert not (tmp_path / "executed").exists()
     assert not Path("executed").exists()
     answer = (
-        printed.err.rpartition("bag_replay: ")[2].replace(str(tmp_path), "")
-        if code
-        else f"exit 0, tells `{fault.says}`"
+        printed.err.rpartition("cvcdepth: ")[2].replace(str(tmp_path), "") if code else f"exit 0, tells `{fault.says}`"
     )
     fault_table.add(name, f"`cvcdepth {arguments[0]}`", answer, time.monotonic() - clock)
 

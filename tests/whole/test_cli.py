@@ -4,6 +4,7 @@
 import argparse
 import hashlib
 import json
+import os
 import re
 import shlex
 import subprocess
@@ -13,6 +14,7 @@ from pathlib import Path
 import pytest
 import recordings
 from recordings import SAMPLE, SAMPLE_MCAP
+from repository import ROOT
 
 from cvcdepth_core.networks import DepthNet
 from cvcdepth_core.networks.checkpoint import save_checkpoint
@@ -33,7 +35,7 @@ def refusal(*arguments: str | Path) -> str:
     assert done.returncode == 1, done.stderr
     lines = [line for line in done.stderr.splitlines() if not line.startswith("warning: untrained")]
     assert len(lines) == 1, done.stderr
-    assert lines[0].startswith("bag_replay: ")
+    assert lines[0].startswith("cvcdepth: ")
     return lines[0]
 
 
@@ -46,24 +48,56 @@ def help_of(capsys: pytest.CaptureFixture[str], *command: str) -> str:
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_the_examples_of_every_help_are_accepted(command: str, capsys: pytest.CaptureFixture[str]):
-    examples = re.findall(rf"^  bag_replay ({command} .+)$", help_of(capsys, command), re.MULTILINE)
+    examples = re.findall(rf"^  cvcdepth ({command} .+)$", help_of(capsys, command), re.MULTILINE)
     assert examples
     for example in examples:
-        assert isinstance(build_parser("bag_replay").parse_args(shlex.split(example)), argparse.Namespace)
+        assert isinstance(build_parser("cvcdepth").parse_args(shlex.split(example)), argparse.Namespace)
 
 
 def test_the_programs_help_lists_every_command(capsys: pytest.CaptureFixture[str]):
     text = help_of(capsys)
     for command in COMMANDS:
         assert re.search(rf"^    {command} +\S", text, re.MULTILINE)
-        assert f"bag_replay {command} --help" in text
+        assert f"cvcdepth {command} --help" in text
 
 
 def test_help_and_version_load_neither_torch_nor_ros():
     script = "import sys, cvcdepth_ros.bag_replay; print({'torch', 'cv2', 'rclpy'} & sys.modules.keys())"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout == "set()\n"
-    assert re.fullmatch(r"bag_replay \d+\.\d+\.\d+\n", call("--version").stdout)
+    assert re.fullmatch(r"cvcdepth \d+\.\d+\.\d+\n", call("--version").stdout)
+
+
+def started_as(name: str, folder: Path, *arguments: str) -> "subprocess.CompletedProcess[str]":
+    """The program under the name that an installation gives it."""
+    program = folder / name
+    program.write_text("import sys\nfrom cvcdepth_ros.bag_replay import main\nsys.exit(main())\n")
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    words = [sys.executable, program, *arguments]
+    return subprocess.run(words, capture_output=True, text=True, check=False, timeout=60, env=environment)
+
+
+@pytest.mark.parametrize("name", ["bag_replay", "cvcdepth"])
+def test_usage_and_error_lines_have_the_name_that_was_typed_and_examples_the_one_name(name: str, tmp_path: Path):
+    shown = started_as(name, tmp_path, "rig", "--help").stdout
+    assert shown.startswith(f"usage: {name} rig ")
+    assert "\n  cvcdepth rig drive.mcap\n" in shown
+    assert started_as(name, tmp_path, "fly").stderr.splitlines()[-1].startswith(f"{name}: error: ")
+    failed = started_as(name, tmp_path, "inspect", "gone.mcap")
+    assert failed.stderr == f"{name}: gone.mcap: does not exist\n"
+
+
+def test_what_the_program_says_calls_it_by_one_name():
+    """Where a recording's remedies, a rig file's first line and the examples lead to is `cvcdepth`."""
+    sources = [*(ROOT / "cvcdepth_core").rglob("*.py"), *(ROOT / "cvcdepth_ros").rglob("*.py")]
+    pages = [ROOT / "README.md", *(ROOT / "config").rglob("*.*"), *(ROOT / "docs").glob("*.md")]
+    called = {
+        f"{path.relative_to(ROOT)}: {line.strip()}"
+        for path in (*sources, *pages)
+        for line in path.read_text(encoding="utf-8").splitlines()
+        if re.search(rf"bag_replay`? ({'|'.join(COMMANDS)})\b", line) and "cvcdepth_ros.bag_replay " not in line
+    }
+    assert called == set()
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`bag_replay evaluate`: the depth that is scored, scores by strangers' arithmetic, many recordings, the page."""
+"""`cvcdepth evaluate`: the depth that is scored, scores by strangers' arithmetic, many recordings, the page."""
 
 import csv
 import hashlib
@@ -29,15 +29,15 @@ from cvcdepth_core.networks import DepthNet
 from cvcdepth_core.networks.checkpoint import save_checkpoint
 from cvcdepth_core.networks.registry import DepthModelSpec
 from cvcdepth_core.scoring.references import FixedDepth
+from cvcdepth_ros import reports
 from cvcdepth_ros.bag_replay import main
-from cvcdepth_ros.commands import arguments
 from cvcdepth_ros.evaluation.image_scores import LabelFree, SetScore
 from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings
 from cvcdepth_ros.evaluation.measuring import RecordingScores, Remeasuring, open_evaluation
 from cvcdepth_ros.evaluation.result import Failure
 from cvcdepth_ros.evaluation.workers import evaluate_all
 from cvcdepth_ros.recordings.replay import DepthReplay
-from cvcdepth_ros.reports.evaluation_page import chosen_sets
+from cvcdepth_ros.reports.shown_sets import chosen_sets
 
 SMALL = ("--untrained", "--height", "64", "--width", "96")
 CONSTANT = ("--predictor", "constant", "--height", "64", "--width", "96")
@@ -398,7 +398,7 @@ def test_names_from_files_are_text_on_the_page_and_nothing_else(two_sets: Path, 
 def test_without_the_packages_for_the_page_everything_else_is_written(
     two_sets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    monkeypatch.setattr(arguments, "find_spec", lambda name: None if name == "matplotlib" else object())
+    monkeypatch.setattr(reports, "find_spec", lambda name: None if name == "matplotlib" else object())
     assert score(tmp_path, two_sets, *CONSTANT, report=True)["sets"] == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "matplotlib" in line

@@ -20,7 +20,7 @@ def constant(depth: float, with_lidar: bool = True, start: float = 0.25) -> Eval
     fields = {"predictor": "constant", "constant_depth": depth, "height": 64, "width": 96}
     settings = EvaluationSettings.model_validate(fields)
     job = EvaluationJob("drive", str(SAMPLE), settings, lidar=None if with_lidar else (), start=start)
-    return EvaluationResult.of([job], [evaluate_recording(job)], settings.dependencies())
+    return EvaluationResult.from_outcomes([job], [evaluate_recording(job)], settings.dependencies())
 
 
 @pytest.mark.parametrize("with_lidar", [True, False])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`bag_replay bench` over real DDS, at the smallest size that means anything."""
+"""`cvcdepth bench` over real DDS, at the smallest size that means anything."""
 
 import json
 from collections.abc import Iterator
@@ -22,7 +22,7 @@ def domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         yield
 
 
-def test_one_line_compares_the_node_with_the_straightforward_one(capsys: pytest.CaptureFixture[str]):
+def test_one_line_compares_the_node_with_the_baseline(capsys: pytest.CaptureFixture[str]):
     assert main(["bench", str(SAMPLE), *SMALL]) == 0
     result = json.loads(capsys.readouterr().out.splitlines()[-1])
     for found in (result, result["baseline"]):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`bag_replay play`: player and subscriber in processes of their own, over real DDS."""
+"""`cvcdepth play`: player and subscriber in processes of their own, over real DDS."""
 
 import json
 import os

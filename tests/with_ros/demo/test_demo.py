@@ -305,7 +305,7 @@ def diagnostics(published: int, matched: int = 10, replaced: int = 0) -> Any:
             camera_status(name, CameraCondition(CameraState.OK), values, CameraWatch(1.0, 1.0), lost=3)
             for name, values in cameras.items()
         ),
-        SynchronisationStatus(0.5).of(SynchronizerStatistics(matched, cameras), mailbox, counters),
+        SynchronisationStatus(0.5).status(SynchronizerStatistics(matched, cameras), mailbox, counters),
         inference_status(latencies.summaries(), mailbox, "", "a model"),
     ]
     for entry in statuses:

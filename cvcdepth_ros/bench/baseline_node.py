@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node as one writes it at first: the baseline of `bag_replay bench`.
+"""The baseline of `cvcdepth bench`: the node as one writes it at first.
 
 One callback decodes, rectifies, estimates and publishes a set, everything and one after the other, as soon as the set
 is complete. Parameters, topics and messages are those of `surround_depth_node`.
@@ -21,7 +21,7 @@ from rclpy.node import Node
 from cvcdepth_core.errors import CvcDepthError
 from cvcdepth_core.estimator import SurroundDepthEstimator
 from cvcdepth_core.rig.rig_file import load_rig_layout
-from cvcdepth_ros.bench.straightforward import straightforward_cloud
+from cvcdepth_ros.bench.baseline_cloud import baseline_cloud
 from cvcdepth_ros.live.mailbox import MailboxStatistics
 from cvcdepth_ros.live.process_setup import prepare_process
 from cvcdepth_ros.messages.conversion import ros_message_class, ros_message_factory, stamp_ns
@@ -34,8 +34,8 @@ from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet, estimate_set
 from cvcdepth_ros.surround_sets.synchronizer import SurroundSet, SurroundSynchronizer
 
 
-class StraightforwardNode(Node):  # type: ignore[misc] # rclpy is not annotated
-    """Needs a complete rig file."""
+class BaselineNode(Node):  # type: ignore[misc] # rclpy is not annotated
+    """Turns images into depth in one callback; needs a complete rig file."""
 
     def __init__(self) -> None:
         super().__init__("surround_depth")
@@ -76,7 +76,7 @@ class StraightforwardNode(Node):  # type: ignore[misc] # rclpy is not annotated
         images, rig, limits = surround_set.images, self._surround.rig, self._settings.cloud_limits
         result = estimate_set(images, self._surround, self._latencies, len(images))
         with self._latencies.measure("postprocess"):
-            cloud = straightforward_cloud(result, rig, limits)
+            cloud = baseline_cloud(result, rig, limits)
             merged = self._factory.point_cloud(surround_set.stamp_ns, rig.base_frame, cloud)
         with self._latencies.measure("publish"):
             self._outputs[MERGED_CLOUD].publish(merged)
@@ -87,7 +87,7 @@ class StraightforwardNode(Node):  # type: ignore[misc] # rclpy is not annotated
 
     def _publish_diagnostics(self) -> None:
         statuses = [
-            self._synchronisation.of(self._synchroniser.statistics(), MailboxStatistics(), self._counters),
+            self._synchronisation.status(self._synchroniser.statistics(), MailboxStatistics(), self._counters),
             inference_status(self._latencies.summaries(), MailboxStatistics(), "", self._estimator.model_id),
         ]
         for entry in statuses:
@@ -101,7 +101,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     prepare_process()
     rclpy.init(args=list(sys.argv if arguments is None else arguments))
     with suppress(KeyboardInterrupt, ExternalShutdownException):
-        rclpy.spin(StraightforwardNode())
+        rclpy.spin(BaselineNode())
     rclpy.try_shutdown()
 
 

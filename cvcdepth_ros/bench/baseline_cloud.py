@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The merged cloud as one writes it at first: the baseline of the benchmarks. No ROS here."""
+"""The baseline of the benchmarks: the merged cloud as one writes it at first. No ROS here."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +9,7 @@ from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.surround_depth import SurroundDepth
 
 
-def straightforward_cloud(surround: SurroundDepth, rig: Rig, limits: CloudLimits) -> NDArray[np.float32]:
+def baseline_cloud(surround: SurroundDepth, rig: Rig, limits: CloudLimits) -> NDArray[np.float32]:
     """Return the points [M, 4] that `merged_cloud` returns, whole cameras at a time, by plain numpy."""
     clouds = []
     for index, camera in enumerate(rig.cameras):
