@@ -101,7 +101,7 @@ def chosen_layout(recording: Recording, layout: RigLayout | None, base_frame: st
     return discover_layout(recording, base_frame) if layout is None else layout
 
 
-def discover_layout(recording: Recording, base_frame: str = "base_link") -> RigLayout:
+def discover_layout(recording: Recording, base_frame: str) -> RigLayout:
     """Return the recording's cameras as they are found by their topics, without calibrations and poses.
 
     Raises RecordingError when there are fewer than two.
