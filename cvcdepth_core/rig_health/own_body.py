@@ -3,8 +3,9 @@
 
 For a pixel of the scene below the horizon, the ground bounds the distance from above, so that the vehicle's motion must
 move it by a known number of pixels at least. There the change from one picture to a later one is compared with the
-change that a shift by one pixel in that direction would make. Where the picture has texture and the change is far
-smaller, it shows the vehicle.
+change that a shift by one pixel in that direction would make. Where the picture has texture, the change is far smaller,
+and the texture is still there in the mean of all pictures, it shows the vehicle: a road has little texture and changes
+little, but what it shows now is not what it shows later.
 """
 
 from __future__ import annotations
@@ -32,8 +33,11 @@ _MIN_SHIFT = 1.0  # pixels that the ground moves within MIN_TRAVEL where a pixel
 _MIN_CAMERA_HEIGHT = 0.5  # metres above the ground, where the base frame lies as high as the cameras
 _WINDOW = 9  # pixels over which changes are summed up
 _SEED_TEXTURE, _SEED_RATIO, _GROWN_RATIO = 0.7, 0.7, 1.5  # grey levels per pixel; change by change of one pixel's shift
+_LEAST_PERSISTENCE = 0.6  # share of a seed's texture that is left in the mean of the pictures; of scene 0.1 to 0.4
 _NOISE_PERCENTILE = 5
+_MAX_NOISE = 0.5  # grey levels that may count as noise: where no body is seen, the stillest picture is of a road
 _MIN_SEED_SHARE = 0.002
+_BORDER, _MIN_BORDER_SEEDS = 12, 20  # pixels from the border, and how many seeds a body has there at least
 _CLOSING = 15  # pixels: gaps in the outline of the body that are closed
 
 
@@ -57,6 +61,7 @@ class SelfOcclusionFinder:
         self._examined = (lengths >= _MIN_SHIFT) & self.preprocessor.valid
         self._changes = np.zeros(lengths.shape)
         self._shift_changes = np.zeros(lengths.shape)
+        self._slopes = np.zeros(lengths.shape)
         self.pairs = 0
         """Pairs that were added."""
 
@@ -65,7 +70,9 @@ class SelfOcclusionFinder:
         for camera, pictures in enumerate(zip(earlier, later, strict=True)):
             before, after = map(_smooth_grey, pictures)
             gradient = np.stack([cv2.Sobel(before, cv2.CV_32F, *axis, scale=1 / 8) for axis in ((1, 0), (0, 1))], -1)
-            self._shift_changes[camera] += abs((gradient * self._directions[camera]).sum(axis=-1))
+            slope = (gradient * self._directions[camera]).sum(axis=-1)
+            self._slopes[camera] += slope
+            self._shift_changes[camera] += abs(slope)
             self._changes[camera] += abs(after - before)
         self.pairs += 1
 
@@ -81,14 +88,13 @@ class SelfOcclusionFinder:
                 f"camera {', '.join(self._rig.names)}: none sees ground, which its own body is told from: does "
                 "frame_id name the optical frame, whose z looks forward and whose y looks down?"
             )
-        changes, textures = (
+        changes, textures, lasting = (
             np.stack([cv2.blur(image / self.pairs, (_WINDOW, _WINDOW)) for image in sums])
-            for sums in (self._changes, self._shift_changes)
+            for sums in (self._changes, self._shift_changes, abs(self._slopes))
         )
-        # The stillest picture of the rig shows what the sensors' noise alone changes.
-        noise = min(np.percentile(change[part], _NOISE_PERCENTILE) for change, part in self._examined_parts(changes))
-        ratios = np.maximum(changes - noise, 0) / np.maximum(textures, 1e-3)
-        seeds = self._examined & (textures > _SEED_TEXTURE) & (ratios < _SEED_RATIO)
+        ratios = np.maximum(changes - self._noise(changes), 0) / np.maximum(textures, 1e-3)
+        lasts = lasting > _LEAST_PERSISTENCE * textures
+        seeds = self._examined & (textures > _SEED_TEXTURE) & (ratios < _SEED_RATIO) & lasts
         grown = self._examined & (ratios < _GROWN_RATIO)
         return np.stack([~_enclosed(_connected(*still)) for still in zip(grown, seeds, strict=True)])
 
@@ -100,8 +106,10 @@ class SelfOcclusionFinder:
         mask: NDArray[np.uint8] = cv2.remap(grey, pixels, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.where(mask > 127, 255, 0).astype(np.uint8)
 
-    def _examined_parts(self, changes: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], NDArray[np.bool_]]]:
-        return [(change, part) for change, part in zip(changes, self._examined, strict=True) if part.any()]
+    def _noise(self, changes: NDArray[np.float64]) -> float:
+        """Return how much noise alone changes, grey levels: the stillest picture shows it, if that is of a body."""
+        parts = [change[part] for change, part in zip(changes, self._examined, strict=True) if part.any()]
+        return min(_MAX_NOISE, *(float(np.percentile(part, _NOISE_PERCENTILE)) for part in parts))
 
 
 def _ground_flow(camera: Camera, intrinsics: NDArray[np.float64], height: int, width: int) -> NDArray[np.float64]:
@@ -126,12 +134,21 @@ def _smooth_grey(picture: Picture) -> NDArray[np.float32]:
 
 
 def _connected(grown: NDArray[np.bool_], seeds: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the parts of `grown` that hold enough of `seeds`, gaps closed, and that reach the picture's border."""
+    """Return the parts of `grown` that hold enough of `seeds`, at the picture's border too, with gaps closed."""
     least = _MIN_SEED_SHARE * seeds.size
     still = _parts(grown, lambda part: int((part & seeds).sum()) >= least)
     closed = cv2.morphologyEx(still.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((_CLOSING, _CLOSING), np.uint8)) > 0
-    # What floats inside the picture is a vehicle that drives along, not our own.
-    return _parts(closed, lambda part: bool(part[-1].any() or part[:, 0].any() or part[:, -1].any()))
+    # What floats inside the picture is a vehicle that drives along, not our own, even if a smooth road leads from it to
+    # the border.
+    at_border = seeds & ~_inner(seeds.shape)
+    return _parts(closed, lambda part: int((part & at_border).sum()) >= _MIN_BORDER_SEEDS)
+
+
+def _inner(shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Return what is not near the left, the right or the lower border."""
+    inner = np.zeros(shape, bool)
+    inner[:-_BORDER, _BORDER:-_BORDER] = True
+    return inner
 
 
 def _enclosed(body: NDArray[np.bool_]) -> NDArray[np.bool_]:
