@@ -37,8 +37,21 @@ _LEAST_PERSISTENCE = 0.6  # share of a seed's texture that is left in the mean o
 _NOISE_PERCENTILE = 5
 _MAX_NOISE = 0.5  # grey levels that may count as noise: where no body is seen, the stillest picture is of a road
 _MIN_SEED_SHARE = 0.002
+_ALONG = 0.7  # of the optical axis that points along the vehicle
 _BORDER, _MIN_BORDER_SEEDS = 12, 20  # pixels from the border, and how many seeds a body has there at least
 _CLOSING = 15  # pixels: gaps in the outline of the body that are closed
+
+
+def lane_share(camera: Camera, scene: NDArray[np.bool_]) -> float:
+    """Return which share of where the vehicle drives a mask takes away: 0 for a camera that looks aside.
+
+    `scene` [H, W] is False where the mask is. The lane ahead, or behind, is the lower middle of a camera that looks
+    along the vehicle: what is masked there by mistake is what matters most.
+    """
+    if abs(float(camera.base_T_camera[0, 2])) < _ALONG:
+        return 0.0
+    height, width = scene.shape
+    return float((~scene[2 * height // 3 :, width // 3 : 2 * width // 3]).mean())
 
 
 class SelfOcclusionFinder:
@@ -49,7 +62,7 @@ class SelfOcclusionFinder:
 
     def __init__(self, rig: Rig) -> None:
         image_width, image_height = rig.cameras[0].calibration.image_size
-        self._rig = rig
+        self.rig = rig
         self.preprocessor = SurroundPreprocessor(rig, round(_WIDTH * image_height / image_width), _WIDTH)
         """Rectifies the pictures that `add` takes."""
         flows = [
@@ -85,7 +98,7 @@ class SelfOcclusionFinder:
             return np.ones_like(self._examined)
         if not self._examined.any():
             raise RigError(
-                f"camera {', '.join(self._rig.names)}: none sees ground, which its own body is told from: does "
+                f"camera {', '.join(self.rig.names)}: none sees ground, which its own body is told from: does "
                 "frame_id name the optical frame, whose z looks forward and whose y looks down?"
             )
         changes, textures, lasting = (
@@ -100,7 +113,7 @@ class SelfOcclusionFinder:
 
     def raw_mask(self, camera: int, scene: NDArray[np.bool_]) -> NDArray[np.uint8]:
         """Return `scene` [H, W] of a camera as a mask of its raw image's size: 0 on the vehicle, 255 elsewhere."""
-        found = self._rig.cameras[camera]
+        found = self.rig.cameras[camera]
         pixels = raw_pixels(found.calibration, found.rectified, self.preprocessor.intrinsics[camera])
         grey = np.where(scene, 255, 0).astype(np.uint8)
         mask: NDArray[np.uint8] = cv2.remap(grey, pixels, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +13,7 @@ from cvcdepth_core.errors import RecordingError, RigError, TransformError
 from cvcdepth_core.images.rectifier import Rectifier
 from cvcdepth_core.images.surround import self_occlusion_mask
 from cvcdepth_core.rig.rig import Camera, Rig
+from cvcdepth_core.rig_health.own_body import lane_share
 from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_ros.checks.context import CheckContext, CheckResult, Status
 from cvcdepth_ros.messages.conversion import stamp_ns
@@ -59,20 +60,30 @@ def check_masks(context: CheckContext) -> CheckResult:
         shares = {camera.name: _masked_shares(camera) for camera in masked}
     except RigError as error:
         return CheckResult("failed", str(error), "give a PNG of the image's size, 0 on the vehicle, 255 elsewhere")
-    values = {name: {"share": round(all_, 4), "upper_half": round(up, 4)} for name, (all_, up) in shares.items()}
-    finding = ", ".join(f"{name} {all_:.0%}" for name, (all_, _) in shares.items()) + " masked"
-    odd = [name for name, (all_, up) in shares.items() if all_ == 0 or all_ > _MOSTLY_MASKED or up > all_]
+    values = {name: {part: round(share, 4) for part, share in of.items()} for name, of in shares.items()}
+    finding = ", ".join(f"{name} {_masked_text(of)}" for name, of in shares.items()) + " masked"
+    odd = [name for name, of in shares.items() if not _is_plausible(of)]
     if odd:
         remedy = "0 is the vehicle and 255 the scene: a mask takes away a smaller, lower part of the image"
         return CheckResult("warning", f"{finding}; not plausible: {', '.join(odd)}", remedy, values)
     return CheckResult("passed", finding, values=values)
 
 
-def _masked_shares(camera: Camera) -> tuple[float, float]:
-    """Return the masked share of the whole image and of its upper half."""
+def _is_plausible(shares: Mapping[str, float]) -> bool:
+    return 0 < shares["share"] <= _MOSTLY_MASKED and shares["upper_half"] <= shares["share"]
+
+
+def _masked_text(shares: Mapping[str, float]) -> str:
+    lane = f" ({shares['lane']:.0%} of where the vehicle drives)" if shares["lane"] else ""
+    return f"{shares['share']:.0%}{lane}"
+
+
+def _masked_shares(camera: Camera) -> dict[str, float]:
+    """Return the masked share of the whole image, of its upper half, and of where the vehicle drives."""
     width, height = (max(2, size // _MASK_STEP) for size in camera.calibration.image_size)
-    mask = self_occlusion_mask(camera, Rectifier(camera.calibration, height, width, camera.rectified)) < 0.5
-    return float(mask.mean()), float(mask[: height // 2].mean())
+    scene = self_occlusion_mask(camera, Rectifier(camera.calibration, height, width, camera.rectified)) >= 0.5
+    upper_half = float((~scene[: height // 2]).mean())
+    return {"share": float((~scene).mean()), "upper_half": upper_half, "lane": lane_share(camera, scene)}
 
 
 def check_lidar(context: CheckContext) -> CheckResult:

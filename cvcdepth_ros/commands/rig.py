@@ -3,12 +3,13 @@
 
 import argparse
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cvcdepth_core.errors import ConfigError
 from cvcdepth_ros.commands.arguments import add_json, add_recording, refuse_to_overwrite
-from cvcdepth_ros.console import print_result, table
+from cvcdepth_ros.console import print_result, table, warn
 from cvcdepth_ros.installation import package_version
 
 if TYPE_CHECKING:
@@ -52,26 +53,30 @@ def execute(arguments: argparse.Namespace) -> None:
     with open_recording(arguments.recording) as recording:
         recorded = RecordedRig.from_recording(recording, base_frame=arguments.base_frame)
         layout = recorded.layout.model_copy(update={"anchor": _anchor(recorded.layout, arguments.anchor)})
-        path = recording.path
+        path, shares = recording.path, dict[str, float]()
         if arguments.masks:
             folder = arguments.output.parent / f"{arguments.output.stem}_masks"
             if not arguments.force:
                 refuse_to_overwrite(*(folder / f"{name}.png" for name in layout.names))
-            layout = _with_found_masks(recorded.with_layout(layout), folder)
-    result = _describe(layout, layout.complete())
+            layout, shares = _with_found_masks(recorded.with_layout(layout), folder)
+    result = _describe(layout, layout.complete(), shares)
     source = f"cvcdepth rig {package_version()}, from the recording {path.name}"
     save_rig_layout(arguments.output, layout, f"Written by {source}.\n{_overlaps_text(result)}")
     result = {"file": str(arguments.output), "recording": arguments.recording, **result}
     print_result(result, _text(result), arguments.json)
 
 
-def _with_found_masks(recorded: "RecordedRig", folder: Path) -> "RigLayout":
+def _with_found_masks(recorded: "RecordedRig", folder: Path) -> tuple["RigLayout", dict[str, float]]:
+    """Return the layout with the masks that are found, and the share that each takes of its picture."""
     from cvcdepth_ros.settings import MatchingSettings
     from cvcdepth_ros.training_data.index import index_recording
     from cvcdepth_ros.training_data.own_body_masks import find_self_occlusion, save_masks
 
-    masks = find_self_occlusion(index_recording(recorded.completed(), MatchingSettings()))
-    return save_masks(recorded.layout, masks, folder)
+    found = find_self_occlusion(index_recording(recorded.completed(), MatchingSettings(), needs_overlaps=False))
+    for doubt in found.doubts(folder):
+        warn(f"{recorded.recording.path}: {doubt}")
+    shares = {name: round(body.share, 4) for name, body in found.by_camera.items()}
+    return save_masks(recorded.layout, found, folder), shares
 
 
 def _anchor(layout: "RigLayout", wanted: str | None) -> str:
@@ -80,7 +85,7 @@ def _anchor(layout: "RigLayout", wanted: str | None) -> str:
     return wanted or layout.anchor_camera
 
 
-def _describe(layout: "RigLayout", rig: "Rig") -> dict[str, Any]:
+def _describe(layout: "RigLayout", rig: "Rig", masked: Mapping[str, float]) -> dict[str, Any]:
     return {
         "base_frame": rig.base_frame,
         "anchor": rig.anchor,
@@ -90,6 +95,7 @@ def _describe(layout: "RigLayout", rig: "Rig") -> dict[str, Any]:
                 "image_topic": entry.image_topic,
                 "frame_id": entry.frame_id,
                 "mask": str(entry.mask) if entry.mask else None,
+                "masked_share": masked.get(camera.name),
                 **_view(camera),
             }
             for entry, camera in zip(layout.cameras, rig.cameras, strict=True)
@@ -130,7 +136,7 @@ def _text(result: dict[str, Any]) -> str:
             f"{camera['horizontal_view_degrees']:.1f}",
             f"{camera['width']}x{camera['height']}",
             "rectified" if camera["rectified"] else camera["distortion"],
-            camera["mask"] or "none",
+            _mask_text(camera),
             camera["image_topic"],
         )
         for camera in result["cameras"]
@@ -140,6 +146,11 @@ def _text(result: dict[str, Any]) -> str:
         f"{table(header, cameras)}\n\n{_overlaps_text(result)}\n\n"
         f"base frame {result['base_frame']}, anchor camera {result['anchor']}; written to {result['file']}"
     )
+
+
+def _mask_text(camera: dict[str, Any]) -> str:
+    share = "" if camera["masked_share"] is None else f" ({camera['masked_share']:.0%})"
+    return f"{camera['mask'] or 'none'}{share}"
 
 
 def _overlaps_text(result: dict[str, Any]) -> str:

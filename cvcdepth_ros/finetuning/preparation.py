@@ -127,7 +127,7 @@ def _add_masks(prepared: Prepared, run: Path) -> None:
             layouts.append(index.layout)
     for layout in layouts:
         indexes = [index for index in prepared.indexes if index.layout == layout]
-        masked = _masked(max(indexes, key=len), run)
+        masked = _masked(max(indexes, key=len), run, prepared.warnings)
         prepared.indexes = [
             replace(index, layout=masked) if index.layout == layout else index for index in prepared.indexes
         ]
@@ -136,8 +136,8 @@ def _add_masks(prepared: Prepared, run: Path) -> None:
         prepared.found_masks |= {f"{folder}{name}": mask for name, mask in new.items() if mask is not None}
 
 
-def _masked(index: RecordingIndex, run: Path) -> RigLayout:
-    """Return the layout with the masks that were found in the recording, now or before.
+def _masked(index: RecordingIndex, run: Path, warnings: list[str]) -> RigLayout:
+    """Return the layout with the masks that were found in the recording, now or before; add what is doubtful of them.
 
     Pictures, found again by the rig alone: whoever paints over one must not lose it to another version of the program.
     """
@@ -146,7 +146,9 @@ def _masked(index: RecordingIndex, run: Path) -> RigLayout:
     try:
         names = json.loads((folder / _FOUND_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
-        masked = save_masks(layout, find_self_occlusion(index), folder)
+        found = find_self_occlusion(index)
+        warnings += [f"{index.path}: {doubt}" for doubt in found.doubts(folder)]
+        masked = save_masks(layout, found, folder)
         names = [camera.name for camera in masked.cameras if camera not in layout.cameras]
         folder.mkdir(parents=True, exist_ok=True)
         write_atomically(folder / _FOUND_FILE, json.dumps(names).encode())

@@ -98,10 +98,14 @@ def build_index(path: Location, matching: MatchingSettings, rig_layout: RigLayou
         return index_recording(RecordedRig.from_recording(recording, rig_layout).completed(), matching)
 
 
-def index_recording(recorded: RecordedRig, matching: MatchingSettings) -> RecordingIndex:
-    """Return the index of a rig's recording, which is read through; see `load_index` for the errors."""
+def index_recording(recorded: RecordedRig, matching: MatchingSettings, needs_overlaps: bool = True) -> RecordingIndex:
+    """Return the index of a rig's recording, which is read through; see `load_index` for the errors.
+
+    Depth is learnt from overlaps; for what needs none, cameras may be alone.
+    """
     path, layout = recorded.recording.path, recorded.layout
-    _refuse_lonely_cameras(recorded)
+    if needs_overlaps:
+        _refuse_lonely_cameras(recorded)
     replay = SurroundReplay(recorded, matching)
     truth = RecordedTruth(recorded, lidar=())
     motion = truth.motion

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -11,8 +13,9 @@ from numpy.typing import NDArray
 
 from cvcdepth_core.errors import ImageError
 from cvcdepth_core.files import write_atomically
+from cvcdepth_core.images.decoding import Picture
 from cvcdepth_core.rig.rig_file import RigLayout
-from cvcdepth_core.rig_health.own_body import MIN_TRAVEL, SelfOcclusionFinder
+from cvcdepth_core.rig_health.own_body import MIN_PAIRS, MIN_TRAVEL, SelfOcclusionFinder, lane_share
 from cvcdepth_core.training.config import RecordingsConfig
 from cvcdepth_ros.training_data.index import RecordingIndex
 from cvcdepth_ros.training_data.sample_choice import change_between
@@ -22,37 +25,87 @@ _MAX_PAIRS = 60
 _MIN_IMAGE_CHANGE = 4.0  # grey levels of the small pictures, where no motion is recorded: half a metre in a street
 _MAX_INTERVAL_NS = 3_000_000_000
 _LEAST_SHARE = 0.002
+_DOUBTFUL_SHARE, _DOUBTFUL_LANE = 0.3, 0.1
+_RED = np.array([127, 0, 0], np.uint8)
+
+OVERLAY = "_overlay.jpg"
+"""After a camera's name, the file that shows its mask on a picture."""
 
 
-def find_self_occlusion(index: RecordingIndex) -> dict[str, NDArray[np.uint8]]:
-    """Return a mask, uint8 [h, w] of the raw image's size, 0 on the vehicle, for each camera that sees the vehicle.
+class OwnBody(NamedTuple):
+    """Where a camera sees its own vehicle."""
 
-    Cameras that have a mask already are left out. Nothing is found where the vehicle hardly moves (fewer than
-    `self_occlusion.MIN_PAIRS` pairs of pictures).
+    mask: NDArray[np.uint8]
+    """[h, w] of the raw image's size, 0 on the vehicle, 255 elsewhere."""
+    overlay: Picture
+    """[H, W, 3] a rectified picture, small, with the mask in red: to be looked at."""
+    share: float
+    """Masked share of the picture."""
+    lane: float
+    """Masked share of where the vehicle drives, see `lane_share`."""
+
+
+class OwnBodies(NamedTuple):
+    """What was found in a recording."""
+
+    by_camera: Mapping[str, OwnBody]
+    pairs: int
+    """Pairs of pictures that were compared."""
+
+    def doubts(self, directory: Path) -> Iterator[str]:
+        """Yield what a person should know, or look at in the directory of `save_masks`."""
+        if self.pairs < MIN_PAIRS:
+            yield (
+                f"no masks: {self.pairs} pairs of pictures between which the vehicle moved {MIN_TRAVEL} m, to look for "
+                f"its own body {MIN_PAIRS} are needed; a longer drive has them"
+            )
+        for name, body in self.by_camera.items():
+            if body.lane > _DOUBTFUL_LANE:
+                where = f"{body.lane:.0%} of where the vehicle drives in its picture"
+                yield f"camera {name}: its mask takes {body.share:.0%}, and {where}: look at {directory / (name + OVERLAY)}"
+            elif body.share > _DOUBTFUL_SHARE:
+                yield f"camera {name}: its mask takes {body.share:.0%} of the picture: look at {directory / (name + OVERLAY)}"
+
+
+def find_self_occlusion(index: RecordingIndex) -> OwnBodies:
+    """Return where each camera sees the vehicle itself; cameras that have a mask already are left out.
+
+    Nothing is found where the vehicle hardly moves: fewer than `MIN_PAIRS` pairs of pictures.
     """
     finder = SelfOcclusionFinder(index.layout.complete())
     height, width = finder.preprocessor.valid.shape[1:]
     reader = SampleReader([index], [], height, width, RecordingsConfig(cache_mb=0))
+    shown: list[Picture] = []
     for earlier, later in _pairs(index):
         try:
-            finder.add(list(reader.pictures(0, earlier)), list(reader.pictures(0, later)))
+            before, shown = list(reader.pictures(0, earlier)), list(reader.pictures(0, later))
+            finder.add(before, shown)
         except ImageError:  # one damaged picture shows nothing of the vehicle
             continue
-    scene = finder.scene()
-    return {
-        entry.name: finder.raw_mask(camera, scene[camera])
-        for camera, entry in enumerate(index.layout.cameras)
-        if entry.mask is None and not entry.mask_polygons and (~scene[camera]).mean() > _LEAST_SHARE
+    bodies = {
+        entry.name: _own_body(finder, camera, scene, shown[camera])
+        for camera, (entry, scene) in enumerate(zip(index.layout.cameras, finder.scene(), strict=True))
+        if entry.mask is None and not entry.mask_polygons and (~scene).mean() > _LEAST_SHARE
     }
+    return OwnBodies(bodies, finder.pairs)
 
 
-def save_masks(layout: RigLayout, masks: dict[str, NDArray[np.uint8]], directory: Path) -> RigLayout:
-    """Write the masks as `<camera>.png` into `directory` and return the layout that names them."""
+def _own_body(finder: SelfOcclusionFinder, camera: int, scene: NDArray[np.bool_], picture: Picture) -> OwnBody:
+    overlay = picture.copy()
+    overlay[~scene] = overlay[~scene] // 2 + _RED
+    lane = lane_share(finder.rig.cameras[camera], scene)
+    return OwnBody(finder.raw_mask(camera, scene), overlay, float((~scene).mean()), lane)
+
+
+def save_masks(layout: RigLayout, found: OwnBodies, directory: Path) -> RigLayout:
+    """Write the masks as `<camera>.png`, with overlays beside them, and return the layout that names the masks."""
     paths = {}
-    for name, mask in masks.items():
+    for name, body in found.by_camera.items():
         paths[name] = directory / f"{name}.png"
         directory.mkdir(parents=True, exist_ok=True)
-        write_atomically(paths[name], cv2.imencode(".png", mask)[1].tobytes())
+        write_atomically(paths[name], cv2.imencode(".png", body.mask)[1].tobytes())
+        overlay = cv2.cvtColor(body.overlay, cv2.COLOR_RGB2BGR)
+        write_atomically(directory / f"{name}{OVERLAY}", cv2.imencode(".jpg", overlay)[1].tobytes())
     cameras = tuple(
         camera.model_copy(update={"mask": paths[camera.name]}) if camera.name in paths else camera
         for camera in layout.cameras

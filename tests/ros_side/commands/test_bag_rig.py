@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import recordings
@@ -150,3 +151,30 @@ def test_a_missing_transform_is_named(tmp_path: Path, capsys: pytest.CaptureFixt
     line = refusal(recordings.write_rosbag2(tmp_path / "no_transform", entries), tmp_path, capsys)
     assert "right_camera_optical_frame" in line
     assert "base_footprint" in refusal(SAMPLE, tmp_path, capsys, "--base-frame", "base_footprint")
+
+
+def test_masks_come_with_their_share_and_a_picture_to_look_at_and_need_no_overlap(tmp_path, capsys):
+    """Two cameras that share no view: depth cannot be learnt from them, but their own vehicle can be seen."""
+    others = [f"/camera/{name}/" for name in CAMERAS if name not in ("front", "back")]
+    apart = recordings.write_mcap(tmp_path / "apart.mcap", recordings.without(recordings.sample_entries(), *others))
+    path = tmp_path / "rig.yaml"
+    assert main(["rig", str(apart), "-o", str(path), "--masks", "--json"]) == 0
+    said = capsys.readouterr()
+    cameras = {camera["name"]: camera for camera in json.loads(said.out)["cameras"]}
+    assert cameras["front"]["mask"] is None
+    assert 0.15 < cameras["back"]["masked_share"] < 0.3
+    overlay = cv2.imread(str(tmp_path / "rig_masks" / "back_overlay.jpg"))
+    red = overlay[..., 2].astype(int) - overlay[..., 1] > 60
+    assert abs(red.mean() - cameras["back"]["masked_share"]) < 0.02
+    assert "camera back: its mask takes" in said.err
+    assert (
+        f"of where the vehicle drives in its picture: look at {tmp_path / 'rig_masks' / 'back_overlay.jpg'}" in said.err
+    )
+
+
+def test_too_short_a_recording_is_said_to_be_too_short_for_masks(tmp_path, capsys):
+    short = recordings.write_mcap(tmp_path / "short.mcap", recordings.sample_entries(sets=4))
+    assert main(["rig", str(short), "-o", str(tmp_path / "rig.yaml"), "--masks"]) == 0
+    error = capsys.readouterr().err
+    assert "short.mcap: no masks: " in error
+    assert "pairs of pictures between which the vehicle moved 0.5 m, to look for its own body 8 are needed" in error
