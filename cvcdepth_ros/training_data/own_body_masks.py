@@ -60,11 +60,11 @@ class OwnBodies(NamedTuple):
                 f"its own body {MIN_PAIRS} are needed; a longer drive has them"
             )
         for name, body in self.by_camera.items():
+            taken, look = f"camera {name}: its mask takes {body.share:.0%}", f"look at {directory / (name + OVERLAY)}"
             if body.lane > _DOUBTFUL_LANE:
-                where = f"{body.lane:.0%} of where the vehicle drives in its picture"
-                yield f"camera {name}: its mask takes {body.share:.0%}, and {where}: look at {directory / (name + OVERLAY)}"
+                yield f"{taken}, and {body.lane:.0%} of where the vehicle drives in its picture: {look}"
             elif body.share > _DOUBTFUL_SHARE:
-                yield f"camera {name}: its mask takes {body.share:.0%} of the picture: look at {directory / (name + OVERLAY)}"
+                yield f"{taken} of the picture: {look}"
 
 
 def find_self_occlusion(index: RecordingIndex) -> OwnBodies:
