@@ -144,6 +144,19 @@ class Recording:
             )
         )
 
+    def first_messages(self, topics: Collection[str]) -> dict[str, RecordedMessage]:
+        """Return the first message of each topic that has any; parts of the files with none of them are not read."""
+        found: dict[str, RecordedMessage] = {}
+        position: int | None = 0
+        while position is not None and (awaited := set(topics) - found.keys()):
+            start, position = position, None
+            for message in self.messages(awaited, start):
+                if message.topic in found:
+                    position = message.log_time
+                    break
+                found[message.topic] = message
+        return found
+
     def deserialize(self, message: RecordedMessage) -> Any:
         """Return the message as an object whose attributes are those of rclpy's class; arrays are numpy arrays.
 

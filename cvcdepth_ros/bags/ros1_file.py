@@ -30,6 +30,8 @@ from cvcdepth_ros.bags.topics import LATCHED, Topic, error_text, joined_topics
 MAGIC = b"#ROSBAG V2.0\n"
 _MD5_OF_NOTHING = "d41d8cd98f00b204e9800998ecf8427e"
 _PAIR_BYTES = 8
+# The same message, from before tf2.
+_LATER_NAMES = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
 
 
 class _Connection(NamedTuple):
@@ -194,6 +196,7 @@ def _add_connection(index: _Index, record: Record, data: bytes) -> None:
     parts = [part for part in topic.split("/") if part]
     name = "/" * topic.startswith("/") + "/".join(parts)
     type_, definition = normal_type_name(said.text("type")), said.text("message_definition")
+    type_ = _LATER_NAMES.get(type_, type_)
     latched = said.text("latching") == "1"
     index.connections[record.number("conn")] = _Connection(name, type_, said.text("md5sum"), definition, latched)
 

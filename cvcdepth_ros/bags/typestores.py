@@ -7,7 +7,7 @@ from functools import cache, lru_cache
 from keyword import iskeyword
 
 from rosbags.interfaces import Nodetype
-from rosbags.interfaces.typing import FieldDesc, Fielddefs, Typesdict
+from rosbags.interfaces.typing import Fielddefs, FieldDesc, Typesdict
 from rosbags.typesys import Stores, get_types_from_idl, get_typestore
 from rosbags.typesys.store import Typestore
 

@@ -16,10 +16,11 @@ from cvcdepth_core.errors import ImageError, RecordingError, RigError, Transform
 from cvcdepth_core.images.decoding import Picture
 from cvcdepth_core.rig.rig import Rig, RigLayout
 from cvcdepth_ros.bags import RecordedMessage, Recording
+from cvcdepth_ros.messages.camera_discovery import IMAGE_TYPES
 from cvcdepth_ros.messages.conversion import picture_from_message
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
 from cvcdepth_ros.recordings.lidar import VehicleMotion, find_lidars
-from cvcdepth_ros.recordings.rig import IMAGE_TYPES, collect_rig, discover_layout
+from cvcdepth_ros.recordings.rig import collect_rig, discover_layout
 from cvcdepth_ros.recordings.topic_timing import TopicTiming
 from cvcdepth_ros.surround_sets.synchronizer import SurroundSet, SurroundSynchronizer
 
@@ -89,7 +90,7 @@ class CheckContext:
         """Why the cameras make no rig at all."""
         self.assembler = self._collected(rig_layout)
         """None where the cameras make no rig, or the transforms contradict each other."""
-        self.lidars, self.clouds_of_cameras = find_lidars(recording) if options.lidar is None else (options.lidar, ())
+        self.lidars, self.clouds_of_cameras = find_lidars(recording) if options.lidar is None else (options.lidar, {})
         self.motion = self._found_motion()
         self.motion_problem: str | None = None
         """The first impossible pose."""

@@ -14,9 +14,10 @@ from cvcdepth_core.images.rectifier import Rectifier, self_occlusion_mask
 from cvcdepth_core.rig.rig import Camera, Rig
 from cvcdepth_core.scoring.ground_truth import PinholeView
 from cvcdepth_ros.checks.context import CheckContext, CheckResult, Status
+from cvcdepth_ros.messages.cloud_sources import describe_left_out_clouds
 from cvcdepth_ros.messages.conversion import stamp_ns
 from cvcdepth_ros.messages.transforms import TransformTree
-from cvcdepth_ros.recordings.lidar import LidarSweeps, cloud_topics, told_of_cameras
+from cvcdepth_ros.recordings.lidar import LidarSweeps, cloud_topics
 from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS
 
 _NEEDS_RIG = CheckResult("skipped", "needs all cameras with calibration and transform")
@@ -127,7 +128,7 @@ def _with_refusals(result: CheckResult, refusals: Sequence[str]) -> CheckResult:
 def _with_left_out(context: CheckContext, result: CheckResult) -> CheckResult:
     if not context.clouds_of_cameras:
         return result
-    finding = told_of_cameras(context.clouds_of_cameras)
+    finding = describe_left_out_clouds(context.clouds_of_cameras)
     return _worsened(result, finding, "name the LiDARs with --lidar, and nothing else is looked at")
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cvcdepth_core.errors import ConfigError
-from cvcdepth_ros.commands.arguments import add_json, add_recording, print_result, refuse_to_overwrite, table
+from cvcdepth_ros.commands.arguments import add_json, add_recording, print_result, refuse_to_overwrite, table, warn
 from cvcdepth_ros.version import package_version
 
 if TYPE_CHECKING:
@@ -43,6 +43,7 @@ def execute(arguments: argparse.Namespace) -> None:
     """Write the rig file and show what is in it."""
     from cvcdepth_core.rig.rig import save_rig_layout
     from cvcdepth_ros.bags import open_recording
+    from cvcdepth_ros.messages.rig_notes import rig_notes
     from cvcdepth_ros.recordings.rig import discover_rig
 
     if not arguments.force:
@@ -50,6 +51,8 @@ def execute(arguments: argparse.Namespace) -> None:
     with open_recording(arguments.recording) as recording:
         layout = discover_rig(recording, arguments.base_frame)
         path = recording.path
+        for note in rig_notes(recording, layout):
+            warn(f"{path}: {note}")
     layout = layout.model_copy(update={"anchor": _anchor(layout, arguments.anchor)})
     if arguments.masks:
         folder = arguments.output.parent / f"{arguments.output.stem}_masks"

@@ -11,6 +11,7 @@ from cvcdepth_core.errors import TransformError
 from cvcdepth_core.rig.poses import Pose
 from cvcdepth_ros.bags import RecordedMessage, RecordingWriter
 from cvcdepth_ros.messages.conversion import bag_message_factory
+from cvcdepth_ros.messages.transform_topics import moving_transform_topics, static_transform_topics
 from cvcdepth_ros.messages.transforms import TransformTree, frame_name
 from cvcdepth_ros.recordings.replay import EstimatedSet, Handlers, SurroundReplay
 from cvcdepth_ros.recordings.rig import STATIC_TRANSFORMS
@@ -74,14 +75,15 @@ class DepthRecorder:
             self._writer.write(f"{_NODE}/{output.topic}", images.images[output.camera].log_time, output.message)
 
     def _moving_transforms(self) -> Handlers:
-        moving = self._replay.recording.topics.get(TRANSFORMS)
-        if moving is None or moving.type != _TRANSFORM_TYPE:
+        recording = self._replay.recording
+        topics = moving_transform_topics(recording)
+        if not topics:
             return {}
-        self._writer.add_topic(TRANSFORMS, _TRANSFORM_TYPE, moving.qos or ())
-        return {TRANSFORMS: self._copy}
+        self._writer.add_topic(TRANSFORMS, _TRANSFORM_TYPE, recording.topics[topics[0]].qos or ())
+        return dict.fromkeys(topics, self._copy)
 
     def _copy(self, message: RecordedMessage) -> None:
-        self._writer.write(message.topic, message.log_time, message.cdr)
+        self._writer.write(TRANSFORMS, message.log_time, message.cdr)
 
     def _static_transforms(self, log_time: int) -> Any:
         """Join all fixed transforms to one message: of a latched topic, players and viewers keep the last alone."""
@@ -95,9 +97,8 @@ class DepthRecorder:
 
     def _recorded_links(self) -> Iterator[Any]:
         recording = self._replay.recording
-        if STATIC_TRANSFORMS in recording.topics:
-            for message in recording.messages([STATIC_TRANSFORMS]):
-                yield from recording.deserialize(message).transforms
+        for message in recording.messages(static_transform_topics(recording)):
+            yield from recording.deserialize(message).transforms
 
     def _given_poses(self) -> dict[str, Pose]:
         """Return the rig file's camera poses that the recording lacks or contradicts, by frame."""

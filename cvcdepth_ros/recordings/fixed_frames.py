@@ -12,6 +12,7 @@ import numpy as np
 from cvcdepth_core.errors import TransformError
 from cvcdepth_core.rig.poses import Pose, inverse, quaternion_from_rotation
 from cvcdepth_ros.bags import RecordedMessage, Recording
+from cvcdepth_ros.messages.transform_topics import moving_transform_topics
 from cvcdepth_ros.messages.transforms import TransformTree, frame_name, links_of
 
 MOVING_TRANSFORMS = "/tf"
@@ -109,10 +110,11 @@ def _chain(tree: TransformTree, links: Mapping[str, ObservedLink], frame: str, f
 
 
 def _spread_messages(recording: Recording) -> Iterator[RecordedMessage]:
+    topics = moving_transform_topics(recording)
     duration = recording.end + 1 - recording.start
     if duration <= _SECONDS_LOOKED_AT * _SECOND:
-        yield from recording.messages([MOVING_TRANSFORMS])
+        yield from recording.messages(topics)
         return
     for number in range(_SECONDS_LOOKED_AT):
         start = recording.start + (duration - _SECOND) * number // (_SECONDS_LOOKED_AT - 1)
-        yield from recording.messages([MOVING_TRANSFORMS], start, start + _SECOND)
+        yield from recording.messages(topics, start, start + _SECOND)

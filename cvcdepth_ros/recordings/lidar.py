@@ -15,16 +15,16 @@ from numpy.typing import NDArray
 from cvcdepth_core.errors import ConfigError, RecordingError, TransformError
 from cvcdepth_core.rig.poses import Pose, inverse, pose_from_quaternion
 from cvcdepth_ros.bags import RecordedMessage, Recording
+from cvcdepth_ros.messages.cloud_sources import why_no_lidar
 from cvcdepth_ros.messages.conversion import stamp_ns
+from cvcdepth_ros.messages.transform_topics import moving_transform_topics
 from cvcdepth_ros.messages.transforms import PoseTrack, TransformTree, frame_name
-from cvcdepth_ros.recordings.fixed_frames import MOVING_TRANSFORMS
 from cvcdepth_ros.surround_sets.synchronizer import NANOSECONDS
 
 CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
 ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
 
 _FLOAT_TYPES = {7: "f4", 8: "f8"}  # sensor_msgs/PointField.FLOAT32 and FLOAT64
-_COLOURS = {"rgb", "rgba"}
 _MESSAGES_TO_FIND_MOTION = 1000
 
 
@@ -47,19 +47,14 @@ def cloud_topics(recording: Recording) -> list[str]:
     return sorted(topic.name for topic in recording.topics.values() if topic.type == CLOUD_TYPE and topic.count)
 
 
-def find_lidars(recording: Recording) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the topics of the LiDARs, and those of clouds that were made of pictures, which their colours tell.
+def find_lidars(recording: Recording) -> tuple[tuple[str, ...], dict[str, str]]:
+    """Return the topics of the LiDARs, and for those of other clouds why they are no LiDAR's, see `why_no_lidar`.
 
     The node's own are among these: they are no truth, where a recording was made while it ran.
     """
     clouds = cloud_topics(recording)
-    of_cameras = tuple(topic for topic in clouds if _has_colours(recording, topic))
-    return tuple(topic for topic in clouds if topic not in of_cameras), of_cameras
-
-
-def told_of_cameras(topics: Sequence[str]) -> str:
-    """Say why these clouds, the second that `find_lidars` returns, are no LiDAR's."""
-    return f"not taken for a LiDAR's, since their points have colours: {', '.join(topics)}"
+    reasons = {topic: reason for topic in clouds if (reason := _why_no_lidar(recording, topic)) is not None}
+    return tuple(topic for topic in clouds if topic not in reasons), reasons
 
 
 class VehicleMotion:
@@ -79,7 +74,7 @@ class VehicleMotion:
         topics.
         """
         odometry = sorted(topic.name for topic in recording.topics.values() if topic.type == ODOMETRY_TYPE)
-        for topic in (name for name in (MOVING_TRANSFORMS, *odometry) if name in recording.topics):
+        for topic in (*moving_transform_topics(recording), *odometry):
             for message in islice(recording.messages([topic]), _MESSAGES_TO_FIND_MOTION):
                 for parent, child in _moving_links(recording, message):
                     child_T_base = _fixed_pose(static, child, base_frame)
@@ -237,12 +232,12 @@ def _column(message: Any, content: NDArray[np.uint8], name: str, topic: str) -> 
     return column.ravel().astype(np.float64)
 
 
-def _has_colours(recording: Recording, topic: str) -> bool:
-    """Say whether the points of the topic's first message that can be read have colours."""
+def _why_no_lidar(recording: Recording, topic: str) -> str | None:
+    """Judge by the topic's first message that can be read."""
     for message in recording.messages([topic]):
         with suppress(RecordingError):
-            return any(field.name in _COLOURS for field in recording.deserialize(message).fields)
-    return False
+            return why_no_lidar(topic, recording.deserialize(message))
+    return None
 
 
 def _moving_links(recording: Recording, message: RecordedMessage) -> list[tuple[str, str]]:

@@ -19,7 +19,9 @@ from cvcdepth_core.errors import CvcDepthError, RecordingError, RigError
 from cvcdepth_core.estimator import DepthPredictor, SurroundDepth, SurroundDepthEstimator
 from cvcdepth_core.rig.rig import Rig, RigLayout
 from cvcdepth_ros.bags import RecordedMessage, Recording
+from cvcdepth_ros.messages.camera_info import content_of, is_usable
 from cvcdepth_ros.messages.conversion import stamp_ns
+from cvcdepth_ros.messages.recorded_changes import moment_of, with_recorded_calibrations_open
 from cvcdepth_ros.messages.transforms import TransformTree
 from cvcdepth_ros.recordings.rig import add_camera_info, assemble_rig
 from cvcdepth_ros.settings import MatchingSettings
@@ -76,7 +78,9 @@ class SurroundReplay:
         self.layout = layout
         self.unreadable = Refusals()
         """Images and CameraInfo whose bytes are no such message."""
-        self._assembler = assemble_rig(recording, layout)
+        open_layout, self._recalibrated = with_recorded_calibrations_open(recording, layout)
+        self._assembler = assemble_rig(recording, open_layout)
+        self._last_infos: dict[str, tuple[Any, ...]] = {}
         self._rig: Rig | RigError = self._assembler.rig()
         self._tolerance = matching.tolerance
         self._synchroniser: SurroundSynchronizer[RecordedImage] = SurroundSynchronizer.of_rig(
@@ -104,6 +108,16 @@ class SurroundReplay:
     def transforms(self) -> TransformTree:
         """The fixed transforms of the recording."""
         return self._assembler.transforms
+
+    @property
+    def calibration_changes(self) -> list[str]:
+        """Which cameras' calibrations changed in what was read so far, when and how."""
+        return [f"{change}, {moment_of(time, self.recording)}" for time, change in self._assembler.changes]
+
+    @property
+    def notes(self) -> list[str]:
+        """What is odd about the recording and its rig, and how it was understood, a line each."""
+        return [*self.recording.notes, *self._assembler.notes, *self.calibration_changes]
 
     @property
     def statistics(self) -> SynchronizerStatistics:
@@ -167,11 +181,22 @@ class SurroundReplay:
         except RecordingError as error:
             self.unreadable.add(str(error))
             return
+        if self._says_nothing_new(message.topic, info):
+            return
         if add_camera_info(self._assembler, message.topic, info):
             try:
                 self._rig = self._assembler.rig()
             except RigError as error:
                 self._rig = error
+
+    def _says_nothing_new(self, topic: str, info: Any) -> bool:
+        """Say whether a CameraInfo is as the last one, or invalid where the recording's own calibration is used."""
+        content = content_of(info)
+        if self._last_infos.get(topic) == content:
+            return True
+        self._last_infos[topic] = content
+        cameras = {camera.name for camera in self.layout.cameras if camera.camera_info_topic == topic}
+        return cameras <= self._recalibrated and not is_usable(info)
 
 
 @dataclass(frozen=True, eq=False)

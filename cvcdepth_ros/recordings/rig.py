@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The rig of a recording: its cameras found, or a rig file's completed, from CameraInfo, `/tf_static` and `/tf`."""
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from itertools import islice
@@ -12,14 +13,21 @@ from cvcdepth_core.errors import RecordingError, RigError, TransformError
 from cvcdepth_core.rig.calibration import first_validation_message
 from cvcdepth_core.rig.rig import CameraEntry, RigLayout
 from cvcdepth_ros.bags import Recording
-from cvcdepth_ros.messages.camera_discovery import CAMERA_INFO_TYPE, COMPRESSED_IMAGE_TYPE, IMAGE_TYPE, discover_cameras
+from cvcdepth_ros.messages.camera_discovery import CAMERA_INFO_TYPE, IMAGE_TYPES
+from cvcdepth_ros.messages.camera_info import MOST_UNCALIBRATED, is_uncalibrated
+from cvcdepth_ros.messages.recorded_cameras import find_recorded_cameras
+from cvcdepth_ros.messages.recorded_changes import moment_of
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
+from cvcdepth_ros.messages.transform_topics import (
+    describe_transform_topics,
+    moving_transform_topics,
+    static_transform_topics,
+)
 from cvcdepth_ros.messages.transforms import TransformTree, frame_name
-from cvcdepth_ros.recordings.fixed_frames import MOVING_TRANSFORMS, add_fixed_frames, observed_links
+from cvcdepth_ros.recordings.fixed_frames import add_fixed_frames, observed_links
 from cvcdepth_ros.recordings.lidar import cloud_topics
 
 STATIC_TRANSFORMS = "/tf_static"
-IMAGE_TYPES = (IMAGE_TYPE, COMPRESSED_IMAGE_TYPE)
 
 
 def discover_rig(recording: Recording, base_frame: str = "base_link") -> RigLayout:
@@ -46,21 +54,13 @@ def discover_layout(recording: Recording, base_frame: str = "base_link") -> RigL
 
 
 def recorded_cameras(recording: Recording) -> list[CameraEntry]:
-    """Return the cameras of which something was recorded, see `discover_cameras`."""
-    return discover_cameras({topic.name: topic.type for topic in recording.topics.values() if topic.count})
+    """Return the cameras of which something was recorded, see `find_cameras`."""
+    return find_recorded_cameras(recording).cameras
 
 
 def topics_without_images(recording: Recording) -> Iterator[str]:
     """Give the camera_info topics beside which no image was recorded: a rig that is found would silently lack them."""
-    seeing = {camera.camera_info_topic for camera in recorded_cameras(recording)}
-    for topic in recording.topics.values():
-        if topic.type == CAMERA_INFO_TYPE and topic.name not in seeing and not is_of_depth(topic.name):
-            yield topic.name
-
-
-def is_of_depth(topic: str) -> bool:
-    """Say whether a topic's name tells that it is of depth images."""
-    return any(part.lower().startswith(("depth", "compresseddepth")) for part in topic.split("/"))
+    yield from find_recorded_cameras(recording).without_images
 
 
 def assemble_rig(recording: Recording, layout: RigLayout) -> RigAssembler:
@@ -78,7 +78,7 @@ def assemble_rig(recording: Recording, layout: RigLayout) -> RigAssembler:
 
 
 def collect_rig(recording: Recording, layout: RigLayout) -> RigAssembler:
-    """Collect each camera's first CameraInfo and the fixed transforms, as far as they are recorded.
+    """Collect each camera's first CameraInfo with a calibration and the fixed transforms, as far as they are recorded.
 
     Transforms are those of `/tf_static`; frames of cameras and LiDARs that are not connected there are looked for on
     `/tf`, see `add_fixed_frames`. Raises TransformError for transforms that contradict each other, and for a camera
@@ -100,26 +100,29 @@ def add_camera_info(assembler: RigAssembler, topic: str, message: Any) -> bool:
 def _add_first_camera_infos(assembler: RigAssembler, recording: Recording) -> None:
     recorded = {topic.name for topic in recording.topics.values() if topic.type == CAMERA_INFO_TYPE}
     awaited = {camera.camera_info_topic for camera in assembler.layout.cameras} & recorded
+    looked_at: Counter[str] = Counter()
     for message in recording.messages(awaited):
         if message.topic in awaited:
-            add_camera_info(assembler, message.topic, recording.deserialize(message))
-            awaited.remove(message.topic)
+            info = recording.deserialize(message)
+            add_camera_info(assembler, message.topic, info)
+            looked_at[message.topic] += 1
+            if not is_uncalibrated(info) or looked_at[message.topic] == MOST_UNCALIBRATED:
+                awaited.remove(message.topic)
         if not awaited:
             return
 
 
 def _add_static_transforms(assembler: RigAssembler, recording: Recording) -> None:
-    if STATIC_TRANSFORMS not in recording.topics:
-        return
-    for message in recording.messages([STATIC_TRANSFORMS]):
+    assembler.about_transforms = describe_transform_topics(recording)
+    for message in recording.messages(static_transform_topics(recording)):
         try:
-            assembler.transforms.add_message(recording.deserialize(message))
+            assembler.transforms.add_message(recording.deserialize(message), moment_of(message.log_time, recording))
         except TransformError as error:
-            raise TransformError(f"{recording.path}: {STATIC_TRANSFORMS}: {error}") from error
+            raise TransformError(f"{recording.path}: {message.topic}: {error}") from error
 
 
 def _add_fixed_frames(assembler: RigAssembler, recording: Recording) -> None:
-    if MOVING_TRANSFORMS not in recording.topics:
+    if not moving_transform_topics(recording):
         return
     tree, base_frame = assembler.transforms, assembler.layout.base_frame
     open_cameras = [camera.name for camera in assembler.layout.cameras if camera.base_T_camera is None]
@@ -175,7 +178,9 @@ def _topic_problem(recording: Recording, name: str, types: Sequence[str]) -> str
 def _too_few(entries: Sequence[CameraEntry], recording: Recording) -> str:
     infos = [topic.name for topic in recording.topics.values() if topic.type == CAMERA_INFO_TYPE]
     images = [topic.name for topic in recording.topics.values() if topic.type in IMAGE_TYPES]
+    offers = find_recorded_cameras(recording).offers
     return (
         f"a surround rig needs two cameras, found {len(entries)}: a camera is a namespace with a camera_info and an "
         f"image topic; camera_info: {', '.join(infos) or 'none'}; images: {', '.join(images) or 'none'}"
+        f"{offers and f'; {offers}'}"
     )

@@ -34,9 +34,9 @@ class RecordedTruth:
         """
         self._recording, base_frame = replay.recording, replay.layout.base_frame
         self.topics, self.left_out = (
-            find_lidars(self._recording) if lidar is None else (tuple(map(self._checked, lidar)), ())
+            find_lidars(self._recording) if lidar is None else (tuple(map(self._checked, lidar)), {})
         )
-        """The LiDARs' topics, and those with clouds that come from cameras."""
+        """The LiDARs' topics, and why those of other clouds are no LiDARs'."""
         self.motion = VehicleMotion.find(self._recording, base_frame, replay.transforms)
         self.refused = Refusals()
         """Sweeps and moments that are no use, and why."""

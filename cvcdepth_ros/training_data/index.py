@@ -102,6 +102,9 @@ def build_index(path: Location, matching: MatchingSettings, rig_layout: RigLayou
         motion = VehicleMotion.find(recording, layout.base_frame, replay.transforms)
         refused = Refusals()
         sets, thumbnails = _collect(recording, replay, motion, refused)
+        if replay.calibration_changes:
+            change = replay.calibration_changes[0]
+            raise RigError(f"{path}: {change}; take the parts before and after as two recordings")
         if not sets:
             raise RecordingError(f"{path}: no surround set: {replay.why_no_set()}")
         unread = tuple(_unread(recording, replay, refused, len(sets)))
