@@ -30,6 +30,7 @@ from cvcdepth_ros.bags.topics import (
     joined_topics,
 )
 from cvcdepth_ros.bags.typestores import typestore_for
+from cvcdepth_ros.bags.video import VIDEO_DEFINITIONS, RecordedVideos
 
 _LOCAL_READERS: dict[bytes, Callable[[Path], RecordingFile]] = {
     mcap_file.MAGIC: McapFile,
@@ -124,6 +125,14 @@ class Recording:
         """The message types of this recording."""
         return typestore_for(self.topics.values())
 
+    @cached_property
+    def _video_topics(self) -> frozenset[str]:
+        return frozenset(topic.name for topic in self.topics.values() if topic.type in VIDEO_DEFINITIONS)
+
+    @cached_property
+    def _videos(self) -> RecordedVideos:
+        return RecordedVideos(self._stored_messages, self.typestore)
+
     def messages(
         self, topics: Collection[str] | None = None, start: int | None = None, stop: int | None = None
     ) -> Iterator[RecordedMessage]:
@@ -132,6 +141,13 @@ class Recording:
         Memory stays flat: one chunk of each file that is being read. Raises RecordingError for an unknown topic, and
         when the storage itself fails meanwhile.
         """
+        followed = self._video_topics.intersection(self.topics if topics is None else topics)
+        messages = self._stored_messages(topics, start, stop)
+        return self._videos.follow(messages, followed) if followed else messages
+
+    def _stored_messages(
+        self, topics: Collection[str] | None, start: int | None, stop: int | None
+    ) -> Iterator[RecordedMessage]:
         wanted = set(self.topics if topics is None else topics)
         if unknown := wanted - self.topics.keys():
             raise RecordingError(f"{self.path}: no topic {sorted(unknown)}; it has {sorted(self.topics)}")
@@ -160,13 +176,16 @@ class Recording:
     def deserialize(self, message: RecordedMessage) -> Any:
         """Return the message as an object whose attributes are those of rclpy's class; arrays are numpy arrays.
 
-        Raises RecordingError, naming topic, type and time, when the type is unknown or the bytes do not fit it.
+        A packet of a video stream is returned as the `sensor_msgs/Image` that it becomes. Raises RecordingError, naming
+        topic, type and time, when the type is unknown, the bytes do not fit it, or no image can be made of it.
         """
         type_ = self.topics[message.topic].type
         where = f"{self.path}: {message.topic} at {message.log_time} ns"
         if type_ not in self.typestore.fielddefs:
             raise RecordingError(f"{where}: type {type_} is not known, and the recording carries no definition of it")
         try:
+            if message.topic in self._video_topics:
+                return self._videos.image(message, type_)
             return self.typestore.deserialize_cdr(memoryview(message.cdr), type_)
         except _MISFIT as error:
             raise RecordingError(f"{where}: {len(message.cdr)} bytes that are no {type_}: {error}") from error

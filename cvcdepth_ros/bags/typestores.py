@@ -13,6 +13,7 @@ from rosbags.typesys.store import Typestore
 
 from cvcdepth_ros.bags.definitions import NOTHING, types_of_msg
 from cvcdepth_ros.bags.topics import Topic
+from cvcdepth_ros.bags.video import VIDEO_DEFINITIONS
 
 _SEPARATOR = "=" * 80 + "\n"
 _TYPE_NAME = re.compile(r"[A-Za-z]\w*(/[A-Za-z]\w*)+", re.ASCII)
@@ -24,8 +25,11 @@ _MAX_FIELDS = 2000
 
 @cache
 def typestore() -> Typestore:
-    """Return the message types of ROS 2 Jazzy. It is shared: register nothing in it."""
-    return get_typestore(Stores.ROS2_JAZZY)
+    """Return the message types of ROS 2 Jazzy, and those of video streams. It is shared: register nothing in it."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for name, definition in VIDEO_DEFINITIONS.items():
+        store.register(types_of_msg(definition, name))
+    return store
 
 
 def typestore_for(topics: Iterable[Topic]) -> Typestore:

@@ -16,7 +16,7 @@ from cvcdepth_core.errors import ImageError, RecordingError, RigError, Transform
 from cvcdepth_core.images.decoding import Picture
 from cvcdepth_core.rig.rig import Rig, RigLayout
 from cvcdepth_ros.bags import RecordedMessage, Recording
-from cvcdepth_ros.messages.camera_discovery import IMAGE_TYPES
+from cvcdepth_ros.messages.camera_discovery import RECORDED_IMAGE_TYPES
 from cvcdepth_ros.messages.conversion import picture_from_message
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
 from cvcdepth_ros.recordings.lidar import VehicleMotion, find_lidars
@@ -190,7 +190,7 @@ class CheckContext:
 
     def _cameras_by_topic(self) -> dict[str, list[str]]:
         found: dict[str, list[str]] = defaultdict(list)
-        images = {topic.name for topic in self.recording.topics.values() if topic.type in IMAGE_TYPES}
+        images = {topic.name for topic in self.recording.topics.values() if topic.type in RECORDED_IMAGE_TYPES}
         for camera in self.assembler.layout.cameras if self.assembler else ():
             if camera.image_topic in images:
                 found[camera.image_topic].append(camera.name)

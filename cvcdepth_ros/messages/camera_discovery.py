@@ -19,7 +19,10 @@ IMAGE_TYPE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE_TYPE = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 IMAGE_TYPES = (IMAGE_TYPE, COMPRESSED_IMAGE_TYPE)
-"""What is decoded, best first."""
+"""Messages that hold one picture each, best first."""
+VIDEO_TYPES = ("ffmpeg_image_transport_msgs/msg/FFMPEGPacket", "foxglove_msgs/msg/CompressedVideo")
+RECORDED_IMAGE_TYPES = (*IMAGE_TYPES, *VIDEO_TYPES)
+"""What of a recording is decoded, best first: a video stream from its key frames on."""
 
 _INFO = "camera_info"
 # Image transports whose topics lie below the picture's.
@@ -37,7 +40,9 @@ _DRAWN_FOR_CERTAIN = re.compile("masks?|segmentation|semantic|debug|overlay|anno
 _DEPTH_PARTS = ("aligned_depth", "depth_to", "depth_regis")
 _CAMERA_WORDS = {"camera", "cameras", "cam", "cams"}
 _MEASURING_ENCODING = re.compile(r"(16U|16S|32S|32F|64F)C\d+|8SC\d+|8UC2")
-_USUAL_NAME = re.compile(r"image(_(raw|mono|color|colour|rect|rectified|rgb|compressed))*|rgb|color|colour|frame")
+_USUAL_NAME = re.compile(
+    r"image(_(raw|mono|color|colour|rect|rectified|rgb|compressed))*|rgb|color|colour|frame|video|compressed|h26[45]|hevc"
+)
 _COLOUR_WORDS = {"color", "colour", "rgb", "bgr"}
 # A stream that was recorded from time to time only, while somebody looked at it, has fewer images than the whole.
 _WHOLE = 0.9
@@ -90,7 +95,11 @@ def discover_cameras(topic_types: Mapping[str, str]) -> list[CameraEntry]:
     return find_cameras(topic_types).cameras
 
 
-def find_cameras(topic_types: Mapping[str, str], seen: Mapping[str, SeenTopic] | None = None) -> FoundCameras:
+def find_cameras(
+    topic_types: Mapping[str, str],
+    seen: Mapping[str, SeenTopic] | None = None,
+    image_types: Sequence[str] = IMAGE_TYPES,
+) -> FoundCameras:
     """Find the cameras among topics (name -> type), and where it is known what was recorded of them, by that too.
 
     Where a camera has several image topics, whole streams come before those recorded from time to time, rectified
@@ -100,7 +109,7 @@ def find_cameras(topic_types: Mapping[str, str], seen: Mapping[str, SeenTopic] |
     seen = seen or {}
     infos = sorted(topic for topic, type_ in topic_types.items() if type_ == CAMERA_INFO_TYPE)
     namespaces = {_parent(topic): topic for topic in infos if _last(topic) == _INFO}
-    images = [topic for topic, type_ in topic_types.items() if type_ in IMAGE_TYPES]
+    images = [topic for topic, type_ in topic_types.items() if type_ in image_types]
     reasons = {topic: reason for topic in images if (reason := _why_no_picture(topic, seen.get(topic), namespaces))}
     search = _Search(topic_types, seen, namespaces, [topic for topic in images if topic not in reasons])
     return search.found(reasons, [topic for topic in infos if topic not in namespaces.values()])
@@ -177,7 +186,7 @@ class _Search:
             self._count(topic) < _WHOLE * most,
             _USUAL_NAME.fullmatch(name) is None,
             not (_is_rectified(topic) and self._has_colour(topic)),
-            IMAGE_TYPES.index(self._types[topic]),
+            RECORDED_IMAGE_TYPES.index(self._types[topic]),
             _is_rectified(topic),
             not self._has_colour(topic) and "image_raw" not in topic,
             "image_raw" not in topic,
@@ -287,8 +296,10 @@ def _is_rectified(topic: str) -> bool:
 
 
 def _picture_topic(topic: str) -> str:
-    """Return the topic without its image transport's part."""
-    return _parent(topic) if _last(topic).lower() in _TRANSPORTS else topic
+    """Return the topic without its image transport's part, where what is before that names a picture."""
+    parent = _parent(topic)
+    is_transport = _last(topic).lower() in _TRANSPORTS and (_words(_last(parent)) & {"image", "rgb", "color"})
+    return parent if is_transport else topic
 
 
 def _parent(topic: str) -> str:

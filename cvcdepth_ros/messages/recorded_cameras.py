@@ -1,13 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """The cameras of a recording: its topics, with what their first messages tell."""
 
+from collections.abc import Mapping
 from itertools import islice
 from typing import Any
 from weakref import WeakKeyDictionary
 
 from cvcdepth_core.errors import RecordingError
+from cvcdepth_core.images.video import VIDEO_EXTRA, video_is_read
 from cvcdepth_ros.bags import Recording
-from cvcdepth_ros.messages.camera_discovery import CAMERA_INFO_TYPE, IMAGE_TYPES, FoundCameras, SeenTopic, find_cameras
+from cvcdepth_ros.messages.camera_discovery import (
+    CAMERA_INFO_TYPE,
+    RECORDED_IMAGE_TYPES,
+    VIDEO_TYPES,
+    FoundCameras,
+    SeenTopic,
+    find_cameras,
+)
 from cvcdepth_ros.messages.camera_info import MOST_UNCALIBRATED, is_uncalibrated
 
 _found: WeakKeyDictionary[Recording, FoundCameras] = WeakKeyDictionary()
@@ -17,11 +26,20 @@ def find_recorded_cameras(recording: Recording) -> FoundCameras:
     """Return the cameras of which something was recorded, and what is no camera, see `find_cameras`."""
     if recording not in _found:
         topics = {topic.name: topic.type for topic in recording.topics.values() if topic.count}
-        described = [name for name, type_ in topics.items() if type_ in (CAMERA_INFO_TYPE, *IMAGE_TYPES)]
+        described = [name for name, type_ in topics.items() if type_ in (CAMERA_INFO_TYPE, *RECORDED_IMAGE_TYPES)]
         firsts = recording.first_messages(described)
         seen = {name: _seen(recording, name, firsts.get(name)) for name in described}
-        _found[recording] = find_cameras(topics, seen)
+        found = find_cameras(topics, seen, RECORDED_IMAGE_TYPES)
+        found.left_out += _unread_videos(found, topics)
+        _found[recording] = found
     return _found[recording]
+
+
+def _unread_videos(found: FoundCameras, types: Mapping[str, str]) -> list[str]:
+    videos = [camera.image_topic for camera in found.cameras if types[camera.image_topic] in VIDEO_TYPES]
+    if not videos or video_is_read():
+        return []
+    return [f"{', '.join(videos)}: video, which is not read without PyAV; {VIDEO_EXTRA} brings it"]
 
 
 def first_camera_info(recording: Recording, topic: str) -> Any | None:

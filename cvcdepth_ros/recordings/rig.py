@@ -13,7 +13,7 @@ from cvcdepth_core.errors import RecordingError, RigError, TransformError
 from cvcdepth_core.rig.calibration import first_validation_message
 from cvcdepth_core.rig.rig import CameraEntry, RigLayout
 from cvcdepth_ros.bags import Recording
-from cvcdepth_ros.messages.camera_discovery import CAMERA_INFO_TYPE, IMAGE_TYPES
+from cvcdepth_ros.messages.camera_discovery import CAMERA_INFO_TYPE, RECORDED_IMAGE_TYPES
 from cvcdepth_ros.messages.camera_info import MOST_UNCALIBRATED, is_uncalibrated
 from cvcdepth_ros.messages.recorded_cameras import find_recorded_cameras
 from cvcdepth_ros.messages.recorded_changes import moment_of
@@ -158,7 +158,7 @@ def _lidar_frames(recording: Recording) -> Iterator[str]:
 def topic_problems(recording: Recording, layout: RigLayout) -> Iterator[str]:
     """Say what is wrong with the topics that the cameras need, camera by camera."""
     for camera in layout.cameras:
-        problem = _topic_problem(recording, camera.image_topic, IMAGE_TYPES)
+        problem = _topic_problem(recording, camera.image_topic, RECORDED_IMAGE_TYPES)
         if problem is None and (camera.calibration is None or camera.frame_id is None):
             problem = _topic_problem(recording, camera.camera_info_topic, (CAMERA_INFO_TYPE,))
         if problem is not None:
@@ -177,7 +177,7 @@ def _topic_problem(recording: Recording, name: str, types: Sequence[str]) -> str
 
 def _too_few(entries: Sequence[CameraEntry], recording: Recording) -> str:
     infos = [topic.name for topic in recording.topics.values() if topic.type == CAMERA_INFO_TYPE]
-    images = [topic.name for topic in recording.topics.values() if topic.type in IMAGE_TYPES]
+    images = [topic.name for topic in recording.topics.values() if topic.type in RECORDED_IMAGE_TYPES]
     offers = find_recorded_cameras(recording).offers
     return (
         f"a surround rig needs two cameras, found {len(entries)}: a camera is a namespace with a camera_info and an "
