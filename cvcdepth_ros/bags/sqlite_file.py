@@ -5,6 +5,7 @@ import sqlite3
 import sys
 from collections.abc import Collection, Iterator
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from urllib.parse import quote
 
@@ -84,6 +85,8 @@ class SqliteFile(RecordingFile):
         if leftover:
             database.execute("PRAGMA locking_mode=EXCLUSIVE")
         database.execute("PRAGMA trusted_schema=OFF")
+        # Comments of definitions are of any character set.
+        database.text_factory = partial(str, encoding="utf-8", errors="replace")
         if sys.version_info >= (3, 11):  # for names and definitions; Python 3.10 leaves SQLite's own limit, 1 GB
             database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_BLOCK_BYTES)
         return database

@@ -234,9 +234,11 @@ class _Search:
                 told[other] = f"{with_images[other][0]} is left out: {what}"
         return told
 
-    def _order_of_twins(self, namespace: str, topic: str) -> tuple[bool, tuple[object, ...]]:
+    def _order_of_twins(self, namespace: str, topic: str) -> tuple[bool, bool, tuple[object, ...]]:
         info = self._seen.get(self._infos[namespace])
-        return info is not None and info.shifted, self._rank(topic, 0)
+        # What has depth below it was made of the camera's picture, by our own node perhaps.
+        is_made = any(other.startswith(f"{namespace}/depth/") for other in self._types)
+        return info is not None and info.shifted, is_made, self._rank(topic, 0)
 
     def _stray_infos(self) -> Iterator[str]:
         """Tell the camera_infos above other cameras' namespaces to which no image of their own belongs."""

@@ -8,7 +8,7 @@ from weakref import WeakKeyDictionary
 
 from cvcdepth_core.errors import RecordingError
 from cvcdepth_core.images.video import VIDEO_EXTRA, video_is_read
-from cvcdepth_ros.bags import Recording
+from cvcdepth_ros.bags import RecordedMessage, Recording
 from cvcdepth_ros.messages.camera_discovery import (
     CAMERA_INFO_TYPE,
     RECORDED_IMAGE_TYPES,
@@ -22,12 +22,18 @@ from cvcdepth_ros.messages.camera_info import MOST_UNCALIBRATED, is_uncalibrated
 _found: WeakKeyDictionary[Recording, FoundCameras] = WeakKeyDictionary()
 
 
-def find_recorded_cameras(recording: Recording) -> FoundCameras:
-    """Return the cameras of which something was recorded, and what is no camera, see `find_cameras`."""
+def find_recorded_cameras(
+    recording: Recording, already_read: Mapping[str, RecordedMessage] | None = None
+) -> FoundCameras:
+    """Return the cameras of which something was recorded, and what is no camera, see `find_cameras`.
+
+    A message of each topic is looked at: the recording's first one, where none was read before.
+    """
     if recording not in _found:
         topics = {topic.name: topic.type for topic in recording.topics.values() if topic.count}
         described = [name for name, type_ in topics.items() if type_ in (CAMERA_INFO_TYPE, *RECORDED_IMAGE_TYPES)]
-        firsts = recording.first_messages(described)
+        known = already_read or {}
+        firsts = {**recording.first_messages([name for name in described if name not in known]), **known}
         seen = {name: _seen(recording, name, firsts.get(name)) for name in described}
         found = find_cameras(topics, seen, RECORDED_IMAGE_TYPES)
         found.left_out += _unread_videos(found, topics)
@@ -42,12 +48,14 @@ def _unread_videos(found: FoundCameras, types: Mapping[str, str]) -> list[str]:
     return [f"{', '.join(videos)}: video, which is not read without PyAV; {VIDEO_EXTRA} brings it"]
 
 
-def first_camera_info(recording: Recording, topic: str) -> Any | None:
+def first_camera_info(recording: Recording, topic: str, already_read: RecordedMessage | None = None) -> Any | None:
     """Return a topic's first CameraInfo with a calibration, the first one where none has; None where there is none.
 
-    Raises RecordingError for one that cannot be read before.
+    `already_read` is one that will do if it has a calibration. Raises RecordingError for one that cannot be read.
     """
-    first = None
+    first = None if already_read is None else recording.deserialize(already_read)
+    if first is not None and not is_uncalibrated(first):
+        return first
     for message in islice(recording.messages([topic]), MOST_UNCALIBRATED):
         info = recording.deserialize(message)
         if not is_uncalibrated(info):

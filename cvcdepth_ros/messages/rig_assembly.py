@@ -13,6 +13,7 @@ from cvcdepth_ros.messages.camera_info import is_uncalibrated, read_camera_info
 from cvcdepth_ros.messages.conversion import stamp_ns
 from cvcdepth_ros.messages.transforms import TransformTree
 
+_MOST_CHANGES = 100  # a lens that zooms or focuses changes for ever
 _LATE = "the first ones cannot be used (drivers send zeros until they have read their file), the later ones are"
 
 
@@ -28,7 +29,7 @@ class RigAssembler:
         self.about_transforms = ""
         """On which topics a recording has transforms, where these are not the usual ones."""
         self.changes: list[tuple[int, str]] = []
-        """When (stamp, ns) a CameraInfo was not what the camera's former ones were, and what changed."""
+        """When (stamp, ns) a CameraInfo was not what the camera's former ones were, and what changed. Not all."""
         self._calibrations: dict[str, Calibration] = {}
         self._frame_ids: dict[str, str] = {}
         self._refused: dict[str, str] = {}
@@ -74,7 +75,8 @@ class RigAssembler:
         self._stamps.setdefault(camera, stamp_ns(message))
         known = self._calibrations.get(camera)
         self._calibrations[camera] = calibration
-        if known is not None and (change := describe_change(known, calibration)):
+        change = describe_change(known, calibration) if known is not None else None
+        if change and len(self.changes) < _MOST_CHANGES:
             self.changes.append((stamp_ns(message), f"camera {camera}: its calibration changes: {change}"))
         return known != calibration
 

@@ -90,7 +90,7 @@ def summarize(
 ) -> RecordingSummary:
     """Read the messages with start <= log_time < stop (ns), so that damage shows, and describe the recording."""
     timings, first = _read(recording, start, stop, progress)
-    found = find_recorded_cameras(recording)
+    found = find_recorded_cameras(recording, first)
     cameras = tuple(_camera(recording, entry, first) for entry in found.cameras)
     return RecordingSummary(
         path=str(recording.path),
@@ -130,7 +130,7 @@ def _camera(recording: Recording, entry: CameraEntry, first: Mapping[str, Record
     calibration, frame_id, problem = None, None, None
     notes: tuple[str, ...] = ()
     try:
-        info = first_camera_info(recording, entry.camera_info_topic)
+        info = first_camera_info(recording, entry.camera_info_topic, first.get(entry.camera_info_topic))
         if info is None:
             problem = f"no message on {entry.camera_info_topic}"
         else:

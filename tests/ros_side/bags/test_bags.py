@@ -254,6 +254,21 @@ def test_a_message_beyond_measure_in_a_database_costs_only_itself(
         assert f"{sample[2].topic} at {sample[2].log_time} ns skipped: 1000001 bytes" in (recording.damage or "")
 
 
+def test_a_definition_in_another_character_set_is_read_from_a_database(tmp_path: Path):
+    path = recordings.sqlite_copy(tmp_path / "bag", sets=1)
+    with closing(sqlite3.connect(path / "bag.db3")) as database:
+        text = b"float32 a # in \xb0C".hex()
+        database.execute(
+            "INSERT INTO message_definitions(topic_type, encoding, encoded_message_definition, type_description_hash) "
+            f"VALUES ('my_msgs/msg/Angle', 'ros2msg', CAST(x'{text}' AS TEXT), '')"
+        )
+        database.execute("UPDATE topics SET type = 'my_msgs/msg/Angle' WHERE name = '/odom'")
+        database.commit()
+    with open_recording(path) as recording:
+        assert recording.topics["/odom"].definition == "float32 a # in \ufffdC"
+        assert recording.damage is None
+
+
 @pytest.mark.skipif(sys.version_info < (3, 11), reason="sqlite3 has no limits")
 def test_a_name_beyond_measure_in_a_database_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(sqlite_file, "MAX_BLOCK_BYTES", 100_000)

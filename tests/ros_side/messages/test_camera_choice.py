@@ -154,6 +154,14 @@ def test_of_two_namespaces_with_one_frame_the_rectified_one_is_taken_and_the_oth
     )
 
 
+def test_what_the_node_published_while_it_was_recorded_is_no_camera(tmp_path: Path):
+    node = "/surround_depth/{}"
+    depths = small_rig.entries(f"{node}/depth/image_rect", IMAGE, depth("32FC1"), f"{node}/depth/camera_info")
+    pictures = small_rig.entries(f"{node}/image_rect", IMAGE, raw, f"{node}/camera_info")
+    own = [entry for entry in (*depths, *pictures) if not entry.topic.startswith("/tf")]
+    assert topics(find(tmp_path, small_rig.entries(), own)) == [f"/{name}/image_raw/compressed" for name in NAMES]
+
+
 def test_the_other_camera_of_a_stereo_pair_has_no_place_of_its_own():
     infos = {"/rig/left/camera_info": INFO, "/rig/right/camera_info": INFO, "/back/camera_info": INFO}
     images = {"/rig/left/image_raw": IMAGE, "/rig/right/image_raw": IMAGE, "/back/image_raw": IMAGE}
