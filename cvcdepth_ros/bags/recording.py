@@ -184,7 +184,7 @@ class Recording:
         if type_ not in self.typestore.fielddefs:
             raise RecordingError(f"{where}: type {type_} is not known, and the recording carries no definition of it")
         try:
-            if message.topic in self._video_topics:
+            if type_ in VIDEO_DEFINITIONS:
                 return self._videos.image(message, type_)
             return self.typestore.deserialize_cdr(memoryview(message.cdr), type_)
         except _MISFIT as error:

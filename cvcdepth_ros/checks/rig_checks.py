@@ -70,7 +70,7 @@ def check_camera_infos(context: CheckContext) -> CheckResult:
     found = f"{len(sizes)} valid, of the images' size ({distinct})"
     changes = [] if problems or context.has_rig_file else find_calibration_changes(context.recording, assembler.layout)
     if changes:
-        remedy = "take the parts before and after as two recordings, or give the calibration in a rig file (--rig)"
+        remedy = "take the parts before and after as two recordings"
         return CheckResult("warning", f"{found}; {'; '.join(changes[:_TOLD])}", remedy, {"changes": changes})
     return _judged(problems, remedy, found, {"sizes": sizes})
 

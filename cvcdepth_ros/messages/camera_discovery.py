@@ -111,8 +111,9 @@ def find_cameras(
     namespaces = {_parent(topic): topic for topic in infos if _last(topic) == _INFO}
     images = [topic for topic, type_ in topic_types.items() if type_ in image_types]
     reasons = {topic: reason for topic in images if (reason := _why_no_picture(topic, seen.get(topic), namespaces))}
-    search = _Search(topic_types, seen, namespaces, [topic for topic in images if topic not in reasons])
-    return search.found(reasons, [topic for topic in infos if topic not in namespaces.values()])
+    other_infos = [topic for topic in infos if topic not in namespaces.values()]
+    search = _Search(topic_types, seen, namespaces, [topic for topic in images if topic not in reasons], other_infos)
+    return search.found(reasons)
 
 
 class _Search:
@@ -124,18 +125,20 @@ class _Search:
         seen: Mapping[str, SeenTopic],
         namespaces: Mapping[str, str],
         pictures: Sequence[str],
+        other_infos: Sequence[str],
     ) -> None:
         self._types = topic_types
         self._seen = seen
         self._infos = namespaces
         self._below: dict[str, list[str]] = defaultdict(list)
         self._pictures = pictures
+        self._other_infos = other_infos
         for topic in pictures:
             if (owner := self._owner(topic)) is not None:
                 self._below[owner].append(topic)
         self._of_camera = {namespace: self._ranked(namespace) for namespace in sorted(namespaces)}
 
-    def found(self, reasons: Mapping[str, str], other_infos: Sequence[str]) -> FoundCameras:
+    def found(self, reasons: Mapping[str, str]) -> FoundCameras:
         """Choose one image for each namespace, and one namespace for each frame."""
         with_images = {namespace: topics for namespace, topics in self._of_camera.items() if topics}
         twins = self._twins(with_images)
@@ -149,7 +152,8 @@ class _Search:
             )
             for namespace, name in names.items()
         ]
-        of_none = [topic for topic in self._pictures if self._owner(topic) is None]
+        owners = {topic: self._owner(topic) for topic in self._pictures}
+        of_none = [topic for topic, owner in owners.items() if owner is None or owner not in with_images]
         return FoundCameras(
             cameras,
             [
@@ -160,11 +164,14 @@ class _Search:
             [*_grouped(reasons), *self._stray_infos(), *twins.values()],
             [*self._blind(reasons)],
             of_none,
-            _similar(of_none, other_infos),
+            _similar(of_none, self._other_infos),
         )
 
     def _owner(self, topic: str) -> str | None:
-        """Return the nearest namespace above a topic that has a camera_info."""
+        """Return the nearest namespace above a topic that has a camera_info; a CameraInfo beside it comes first."""
+        beside = _parent(_picture_topic(topic))
+        if beside not in self._infos and any(_parent(info) == beside for info in self._other_infos):
+            return None
         parts = topic.split("/")
         above = ("/".join(parts[:count]) for count in range(len(parts) - 1, -1, -1))
         return next((namespace for namespace in above if namespace in self._infos), None)

@@ -201,6 +201,15 @@ def test_a_camera_info_of_another_name_is_offered(name: str, tmp_path: Path):
             discover_rig(recording)
 
 
+@pytest.mark.parametrize("stray", STRAYS)
+def test_a_stray_camera_info_does_not_hide_those_of_other_names(stray: str, tmp_path: Path):
+    drive = small_rig.entries("/cam/{}/image_raw/compressed", info_topic="/cam/{}/calib_info")
+    extra = small_rig.entry(stray, INFO, BEGIN, small_rig.info(BEGIN, "ahead_optical"))
+    found = find(tmp_path, drive, [extra])
+    assert found.cameras == []
+    assert "did you mean /cam/ahead/calib_info" in found.offers
+
+
 def test_one_odd_name_among_three_is_offered_for_its_own_images(tmp_path: Path):
     drive = [
         entry._replace(topic="/port/calib_info") if entry.topic == "/port/camera_info" else entry
