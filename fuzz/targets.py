@@ -30,6 +30,7 @@ _PIXELS = 1 << 16  # keeps one execution short, and is a bound like any other
 _REDUCTIONS: tuple[Reduction, ...] = (1, 2, 4, 8)
 _FORMATS = ("jpeg", "bgr8; jpeg compressed bgr8", "bayer_rggb8; png compressed ", "mono16; png compressed")
 _ENCODINGS = ("rgb8", "bgr8", "8UC3", "rgba8", "bgra8", "mono8", "mono16", "16UC1", "bayer_rggb8", "bayer_gbrg16", "?")
+_ENCODINGS += ("yuv422", "yuyv", "nv12", "nv21", "rgb16", "bgra16")
 _RAW_HEADER = struct.Struct("<BBIIII")
 _MESSAGE_TYPES = (
     "sensor_msgs/msg/CameraInfo",

@@ -9,34 +9,11 @@ from numpy.typing import NDArray
 
 from cvcdepth_core.errors import ImageError
 from cvcdepth_core.images.headers import JPEG_START, PNG_START, ImageHeader, read_header
+from cvcdepth_core.images.pixel_formats import FORMATS, PixelFormat, pixel_format, to_eight_bits, to_rgb, used_bits
 from cvcdepth_core.rig.calibration import MAX_PIXELS
 
 Picture = NDArray[np.uint8]
 
-_CHANNELS = {
-    "rgb8": 3,
-    "bgr8": 3,
-    "8UC3": 3,
-    "rgba8": 4,
-    "bgra8": 4,
-    "mono8": 1,
-    "8UC1": 1,
-    "mono16": 1,
-    "16UC1": 1,
-} | {f"bayer_{pattern}{bits}": 1 for pattern in ("rggb", "bggr", "gbrg", "grbg") for bits in (8, 16)}
-# 8UC3 says nothing of its colours; drivers that leave the encoding generic nearly all send OpenCV's order.
-_TO_RGB = {
-    "bgr8": cv2.COLOR_BGR2RGB,
-    "8UC3": cv2.COLOR_BGR2RGB,
-    "rgba8": cv2.COLOR_RGBA2RGB,
-    "bgra8": cv2.COLOR_BGRA2RGB,
-    "mono8": cv2.COLOR_GRAY2RGB,
-    "8UC1": cv2.COLOR_GRAY2RGB,
-    "bayer_rggb8": cv2.COLOR_BayerRGGB2RGB,
-    "bayer_bggr8": cv2.COLOR_BayerBGGR2RGB,
-    "bayer_gbrg8": cv2.COLOR_BayerGBRG2RGB,
-    "bayer_grbg8": cv2.COLOR_BayerGRBG2RGB,
-}
 _JPEG_SCAN, _JPEG_END = b"\xff\xda", b"\xff\xd9"
 # Writers cut a picture into pieces of 8 KiB or more.
 _MAX_PNG_CHUNKS = 20_000
@@ -44,6 +21,7 @@ _MAX_PNG_CHUNKS = 20_000
 # Progressive JPEG has about ten, and each costs as much time as a whole picture.
 _MAX_SCANS = 64
 
+_ALL_BITS = 16
 Reduction = Literal[1, 2, 4, 8]
 _REDUCED_COLOUR = {
     1: cv2.IMREAD_COLOR,
@@ -70,25 +48,31 @@ def decode_raw(
 ) -> Picture:
     """Turn the fields of a `sensor_msgs/Image` into an RGB picture.
 
-    `pixels` is anything with the buffer protocol. 16-bit images keep their upper eight bits. ImageError names the
-    camera and the field: an unknown encoding, an impossible size or step, more than `max_pixels`, fewer bytes than
-    `step` x `height`, 16-bit values whose bytes are in the other order than `is_bigendian` says.
+    `pixels` is anything with the buffer protocol. 16-bit images keep the upper eight bits of those in use, see
+    `used_bits`. ImageError names the camera and the field: an unknown encoding, an impossible size or step, more than
+    `max_pixels`, fewer bytes than `step` x `height`, 16-bit values whose bytes are in the other order than
+    `is_bigendian` says.
     """
-    if encoding not in _CHANNELS:
-        raise ImageError(
-            f"camera {camera}: encoding '{encoding:.40}' is not supported; there are {', '.join(_CHANNELS)}"
-        )
-    row_bytes = width * _CHANNELS[encoding] * (2 if "16" in encoding else 1)
+    layout = pixel_format(encoding)
+    if layout is None:
+        raise ImageError(f"camera {camera}: encoding '{encoding:.40}' is not supported; there are {', '.join(FORMATS)}")
     buffer = np.frombuffer(pixels, dtype=np.uint8)
-    if width <= 0 or height <= 0 or step < row_bytes:
+    row_bytes = width * layout.channels * (2 if layout.is_deep else 1)
+    is_odd = layout.shares_colour and (width % 2 or (layout.has_colour_plane and height % 2))
+    if width <= 0 or height <= 0 or step < row_bytes or is_odd:
         raise ImageError(f"camera {camera}: size {width}x{height} {encoding} with a step of {step} bytes is impossible")
-    if buffer.size < step * height:
-        raise ImageError(f"camera {camera}: {buffer.size} bytes, but step {step} x height {height} = {step * height}")
+    rows = height
+    if layout.has_colour_plane:
+        rows = height * 3 // 2
+        # Some drivers take the bytes of both planes for those of the rows of one.
+        step = width if step * 2 == width * 3 and buffer.size < step * rows else step
+    if buffer.size < step * rows:
+        raise ImageError(f"camera {camera}: {buffer.size} bytes, but step {step} x height {rows} = {step * rows}")
     _check_pixels(width, height, max_pixels, camera)
-    rows = buffer[: step * height].reshape(height, step)[:, :row_bytes]
-    if "16" in encoding:
-        _check_byte_order(rows, is_bigendian, camera)
-    return _rows_to_rgb(rows, encoding, is_bigendian)
+    content = buffer[: step * rows].reshape(rows, step)[:, :row_bytes]
+    if layout.is_deep:
+        _check_byte_order(content, layout.channels, is_bigendian, camera)
+    return _rows_to_rgb(content, layout, is_bigendian)
 
 
 def decode_compressed(
@@ -155,17 +139,19 @@ def _check_pixels(width: int, height: int, max_pixels: int, camera: str) -> None
         )
 
 
-def _check_byte_order(rows: NDArray[np.uint8], is_bigendian: bool, camera: str) -> None:
+def _check_byte_order(rows: NDArray[np.uint8], channels: int, is_bigendian: bool, camera: str) -> None:
     """Refuse 16-bit rows whose upper bytes would be noise while the lower ones are a picture."""
     sampled = rows[:: max(1, len(rows) // _ROWS_TO_COMPARE)]
-    upper, lower = (_roughness(_upper_bytes(sampled, order)) for order in (is_bigendian, not is_bigendian))
+    # In a mosaic every second pixel has the same colour.
+    apart = 2 if channels == 1 else channels
+    upper, lower = (_roughness(_upper_bytes(sampled, order)[:, ::apart]) for order in (is_bigendian, not is_bigendian))
     if upper > _NOISE and upper > _SMOOTHER * lower > 0.0:
         raise ImageError(f"camera {camera}: is_bigendian = {int(is_bigendian)}, but the bytes are in the other order")
 
 
 def _roughness(plane: NDArray[np.uint8]) -> float:
-    """Mean difference of every second pixel, which have the same colour in a mosaic; 0 where there are too few."""
-    difference = np.abs(np.diff(plane[:, ::2].astype(np.int16), axis=1))
+    """Mean difference of neighbours; 0 where there are none."""
+    difference = np.abs(np.diff(plane.astype(np.int16), axis=1))
     return float(difference.mean()) if difference.size else 0.0
 
 
@@ -190,7 +176,7 @@ def _compressed_encoding(image_format: str) -> str:
     """Say what the decoder will give: a mosaic for image_transport's "bayer_X; jpeg compressed", else bgr8."""
     original, _, coding = image_format.partition(";")
     mosaic = original.strip().replace("16", "8")
-    is_mosaic = mosaic.startswith("bayer_") and mosaic in _TO_RGB and coding.strip().endswith("compressed")
+    is_mosaic = mosaic.startswith("bayer_") and mosaic in FORMATS and coding.strip().endswith("compressed")
     return mosaic if is_mosaic else "bgr8"
 
 
@@ -201,6 +187,7 @@ def _imdecode(encoded: bytes, encoding: str, reduce: Reduction, header: ImageHea
     colour = _REDUCED_COLOUR[reduce] if decoder_reduces else cv2.IMREAD_COLOR
     # The sensor's rows stay rows: an orientation tag would contradict the calibration.
     flags = (colour if encoding == "bgr8" else cv2.IMREAD_GRAYSCALE) | cv2.IMREAD_IGNORE_ORIENTATION
+    flags |= cv2.IMREAD_ANYDEPTH if header.format == "PNG" else 0
     try:
         decoded = cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), flags)
     except cv2.error:
@@ -208,7 +195,8 @@ def _imdecode(encoded: bytes, encoding: str, reduce: Reduction, header: ImageHea
     factor = reduce if decoder_reduces else 1
     if decoded is None or decoded.shape[:2] != (-(-header.height // factor), -(-header.width // factor)):
         return None
-    picture = _to_rgb(decoded, encoding)
+    eight = to_eight_bits(decoded) if decoded.dtype == np.uint16 else decoded
+    picture = to_rgb(eight, FORMATS[encoding].to_rgb)
     return picture if decoder_reduces else reduce_picture(picture, reduce)
 
 
@@ -224,17 +212,12 @@ def reduce_picture(picture: Picture, reduce: int) -> Picture:
     return reduced
 
 
-def _rows_to_rgb(rows: NDArray[np.uint8], encoding: str, is_bigendian: bool) -> Picture:
-    if "16" in encoding:
-        rows, encoding = _upper_bytes(rows, is_bigendian), encoding.replace("16UC1", "mono8").replace("16", "8")
-    channels = _CHANNELS[encoding]
-    image = rows.reshape(rows.shape[0], -1, channels) if channels > 1 else rows
-    return np.ascontiguousarray(image) if encoding == "rgb8" else _to_rgb(np.ascontiguousarray(image), encoding)
-
-
-def _to_rgb(image: NDArray[np.uint8], encoding: str) -> Picture:
-    rgb: Picture = cv2.cvtColor(image, _TO_RGB[encoding])
-    return rgb
+def _rows_to_rgb(rows: NDArray[np.uint8], layout: PixelFormat, is_bigendian: bool) -> Picture:
+    if layout.is_deep:
+        deep = np.ascontiguousarray(rows).view(">u2" if is_bigendian else "<u2")
+        rows = _upper_bytes(rows, is_bigendian) if used_bits(deep) == _ALL_BITS else to_eight_bits(deep)
+    image = rows.reshape(rows.shape[0], -1, layout.channels) if layout.channels > 1 else rows
+    return to_rgb(image, layout.to_rgb)
 
 
 def _upper_bytes(rows: NDArray[np.uint8], is_bigendian: bool) -> NDArray[np.uint8]:

@@ -1,157 +1,116 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading of one .mcap file, whole or damaged.
+"""Reading of one .mcap file, whole or damaged, see `BlockFile`.
 
-The file is seen as blocks (a chunk, or a message outside of chunks) that can be read alone. An intact file's index
-says where they are; a file without one (cut by a power loss, or still being written) is scanned once from its
-beginning. Either way a block that cannot be read, or whose checksum is wrong, is skipped and reported.
-
-Memory is bounded whatever a file declares: no block is larger than `MAX_BLOCK_BYTES` once it is unpacked, and those
-that overlap in time, which must be held together, are no larger in all.
+The index at its end is checked against the file: what lies between the chunks that it lists is walked through, for
+messages may lie outside of chunks. Its counts are compared with what is read.
 """
 
 import io
-import struct
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
-from functools import cache, partial
-from typing import IO, NamedTuple
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import IO
 
-import lz4.frame  # type: ignore[import-untyped]
-import zstandard
-from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, ChunkIndex, Footer, McapRecord, Message, Schema, Statistics
-from mcap.stream_reader import StreamReader, breakup_chunk
-from mcap.summary import Summary
+from mcap.records import Channel, ChunkIndex, Footer, Schema, Statistics
+from mcap.stream_reader import StreamReader
 
-from cvcdepth_ros.bags.ordering import Source, in_time_order
-from cvcdepth_ros.bags.recent_blocks import MESSAGE_BYTES, RecentBlocks
-from cvcdepth_ros.bags.remote import Location, RemotePath
-from cvcdepth_ros.bags.topics import (
-    MAX_BLOCK_BYTES,
-    RecordedMessage,
-    RecordingFile,
-    Topic,
-    joined_topics,
-    recorded_qos,
+from cvcdepth_ros.bags.blocks import Block, BlockFile, ReadChannel
+from cvcdepth_ros.bags.definitions import normal_type_name
+from cvcdepth_ros.bags.mcap_records import (
+    DAMAGE,
+    Record,
+    check_described,
+    content_at,
+    index_counts,
+    messages_in,
+    parsed,
+    record_at,
+    records_in,
 )
+from cvcdepth_ros.bags.recent_blocks import StoredMessage
+from cvcdepth_ros.bags.remote import Location
+from cvcdepth_ros.bags.ros1_messages import Ros1Converter, ros1_definition
+from cvcdepth_ros.bags.topics import MAX_BLOCK_BYTES, Topic, joined_topics, recorded_qos
 
 MAGIC = b"\x89MCAP0\r\n"
-MAX_BLOCK_RECORDS = 2**20
-# Of all topics and types, which are kept as long as the file is read; a thousand of them take some MB.
-_MAX_DESCRIBED_BYTES = 64 * 2**20
 _FOOTER_BYTES = 37  # the footer record and the magic after it
-# A window is asked for again and again: for transforms, for CameraInfo, for the pictures of every training sample.
-_recent = RecentBlocks(80 * 2**20)
-_NEEDED = (Opcode.CHUNK, Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL)
-_DESCRIBING = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA)
-_RECORD_HEADER = struct.Struct("<BQ")  # opcode, length of what follows
-# What mcap and the decompressors raise on damaged bytes (lz4: RuntimeError; wrong CRC and text: ValueError).
-_DAMAGE = (McapError, zstandard.ZstdError, struct.error, ValueError, RuntimeError, KeyError, OverflowError, MemoryError)
 
 
-class _Block(NamedTuple):
-    start: int
-    end: int
-    offset: int
-    channels: frozenset[int]
-    """Ids of the channels with messages in it; empty when the index does not say."""
-    packed: bool = True
-    """Whether it is compressed; so it counts where no index says that it is not."""
+@dataclass
+class _Summary:
+    """The index at the end of a file."""
+
+    begin: int
+    """Byte at which it begins."""
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    chunks: list[ChunkIndex] = field(default_factory=list)
+    statistics: Statistics | None = None
+
+    @property
+    def counts(self) -> dict[int, int]:
+        """Messages per channel, empty where they are not told."""
+        return self.statistics.channel_message_counts if self.statistics else {}
 
 
 @dataclass
 class _Index:
+    """What is known of a file's content."""
+
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     counts: Counter[int] = field(default_factory=Counter)
     """Messages per channel id."""
-    blocks: list[_Block] = field(default_factory=list)
+    blocks: list[Block] = field(default_factory=list)
     described: int = 0
     """Bytes of schemas and channels."""
 
 
-class McapFile(RecordingFile):
+class McapFile(BlockFile):
     """One .mcap file, see `RecordingFile`."""
 
     def __init__(self, path: Location) -> None:
         super().__init__(path)
-        self._key = object()
         with path.open("rb") as stream:
             self.size = stream.seek(0, io.SEEK_END)
-            index = self._indexed(stream)
-            self.indexed = index is not None
-            self._index = index or self._scanned(stream)
-        self.start = min((block.start for block in self._index.blocks), default=None)
-        self.end = max((block.end for block in self._index.blocks), default=None)
-        self.topics = joined_topics([*self._channel_topics()], path)
-        self._held = 0
+            summary = self._readable_summary(stream)
+            index = self._indexed(stream, summary) if summary else None
+            if index is None:
+                self.indexed, index = False, self._scanned(stream)
+        self._blocks = index.blocks
+        self._set_span()
+        self._declared = summary.counts if summary else {}
+        self._check_total(index, summary)
+        self._set_topics(index)
 
-    def messages(self, topics: Collection[str], start: int, stop: int) -> Iterator[RecordedMessage]:
-        """Give the messages of `topics` with start <= log_time < stop, in time order."""
-        wanted = {id_: channel.topic for id_, channel in self._index.channels.items() if channel.topic in topics}
-        blocks = [
-            block
-            for block in self._index.blocks
-            if block.start < stop and block.end >= start and (not block.channels or block.channels & wanted.keys())
-        ]
-        with ExitStack() as opened:
-            stream = _opened_once(self.path, opened)
-            for message in in_time_order(
-                Source(block.start, partial(self._block_messages, stream, block, wanted)) for block in blocks
-            ):
-                if start <= message.log_time < stop:
-                    yield message
-
-    def _block_messages(
-        self, stream: Callable[[], IO[bytes]], block: _Block, wanted: dict[int, str]
-    ) -> Iterator[RecordedMessage]:
-        found = [
-            RecordedMessage(wanted[record.channel_id], record.log_time, record.data)
-            for record in self._block_records(stream, block)
-            if isinstance(record, Message) and record.channel_id in wanted
-        ]
-        size = sum(len(message.cdr) + MESSAGE_BYTES for message in found)
-        if self._held + size > MAX_BLOCK_BYTES:
-            self._report(f"chunk at byte {block.offset} skipped: more than {MAX_BLOCK_BYTES} bytes at the same time")
-            return
-        self._held += size
+    def _intact_messages(self, stream: IO[bytes], offset: int) -> Sequence[StoredMessage]:
         try:
-            yield from sorted(found, key=lambda message: message.log_time)
-        finally:
-            self._held -= size
+            record = record_at(stream, offset, self.size)
+            if record is None:
+                raise McapError("no whole record there")
+            return messages_in(content_at(stream, record) or b"")
+        except DAMAGE as error:
+            self._report(f"chunk at byte {offset} skipped", error)
+            return []
 
-    def _block_records(self, stream: Callable[[], IO[bytes]], block: _Block) -> Sequence[McapRecord]:
-        """Return what is in a block; what had to be fetched or unpacked is kept for the next time."""
-        key = self._key, block.offset
-        records = _recent.get(key)
-        if records is None:
-            records = self._intact_records(stream(), block.offset)
-            if block.packed or isinstance(self.path, RemotePath):
-                _recent.put(key, records)
-        return records
-
-    def _indexed(self, stream: IO[bytes]) -> _Index | None:
-        """Read the index at the end of the file; None when there is none or it does not cover all messages."""
+    def _readable_summary(self, stream: IO[bytes]) -> _Summary | None:
+        """Read the index at the end of the file; None when there is none."""
         stream.seek(max(0, self.size - len(MAGIC)))
         if stream.read() != MAGIC:
             return None
         try:
-            summary = self._summary(stream)
-        except _DAMAGE as error:
+            return self._summary(stream)
+        except DAMAGE as error:
             self._report("index unreadable", error)
             return None
-        if summary is None or not _is_complete(summary):
-            return None
-        return _index_of(summary)
 
-    def _summary(self, stream: IO[bytes]) -> Summary | None:
+    def _summary(self, stream: IO[bytes]) -> _Summary | None:
         """Collect the records of the index; a chunk, which has no place there, is not unpacked."""
         stream.seek(max(0, self.size - _FOOTER_BYTES))
-        footer = next(_records(stream.read()))
+        footer = next(StreamReader(io.BytesIO(stream.read()), skip_magic=True, emit_chunks=True).records)
         if not isinstance(footer, Footer):
             raise McapError(f"{type(footer).__name__} in place of the footer")
         if not footer.summary_start:
@@ -160,154 +119,196 @@ class McapFile(RecordingFile):
         if not 0 < length <= MAX_BLOCK_BYTES:
             raise McapError(f"of {length} bytes")
         stream.seek(footer.summary_start)
-        section = stream.read(length)
-        _check_records(memoryview(section)[: -len(MAGIC)])
-        summary = Summary()
-        for record in _records(section):
-            _add_to_summary(summary, record)
+        section = stream.read(length - len(MAGIC))
+        summary = _Summary(footer.summary_start)
+        for record in records_in(section):
+            _add_to_summary(summary, parsed(section, record))
         return summary
+
+    def _indexed(self, stream: IO[bytes], summary: _Summary) -> _Index | None:
+        """Return what the index tells, with what lies outside of its chunks; None when it does not tell all of them."""
+        if not _knows_its_channels(summary):
+            return None
+        chunks = [chunk for chunk in summary.chunks if not _is_to_be_read(chunk, summary)]
+        spans = sorted((_span(chunk) for chunk in chunks), key=lambda span: span[0])
+        if any(end > start for (_, end), (start, _) in pairwise(spans)):
+            return None
+        index = _Index(summary.schemas, summary.channels)
+        index.blocks += [_block(chunk) for chunk in chunks]
+        for begin, end in _gaps(spans, len(MAGIC), summary.begin):
+            stopped = self._walk(stream, index, begin, end)
+            if stopped is not None:
+                self._report(f"no record at byte {stopped}, passed over up to byte {end}")
+        self.indexed = len(index.blocks) == len(chunks)
+        if not summary.counts:
+            self._count(stream, index, chunks)
+        index.counts.update({id_: count - index.counts[id_] for id_, count in summary.counts.items()})
+        return index
+
+    def _count(self, stream: IO[bytes], index: _Index, chunks: Sequence[ChunkIndex]) -> None:
+        """Add the messages of the chunks by the message indexes behind them, without unpacking any."""
+        for chunk in chunks:
+            stream.seek(chunk.chunk_start_offset + chunk.chunk_length)
+            try:
+                content = stream.read(min(chunk.message_index_length, MAX_BLOCK_BYTES))
+                for channel, count in index_counts(content):
+                    index.counts[channel] += count
+            except DAMAGE as error:
+                self._report(f"message index of the chunk at byte {chunk.chunk_start_offset} unreadable", error)
 
     def _scanned(self, stream: IO[bytes]) -> _Index:
         """Walk through the records from the beginning and index what is whole."""
         index = _Index()
-        offset = len(MAGIC)
-        while (header := self._record_header(stream, offset)) and header[0] != Opcode.DATA_END:
-            records = self._intact_records(stream, offset)
-            try:
-                _add_records(index, offset, records)
-            except McapError as error:
-                self._report(f"chunk at byte {offset} skipped", error)
-            offset += _RECORD_HEADER.size + header[1]
-        if header is None:
+        end = self._walk(stream, index, len(MAGIC), self.size)
+        if end is not None:
             self._report(
-                f"cut or unreadable from byte {offset} of {self.size} on, no index: "
+                f"cut or unreadable from byte {end} of {self.size} on, no index: "
                 f"{index.counts.total()} messages of the {len(index.blocks)} chunks before it recovered"
             )
         return index
 
-    def _record_header(self, stream: IO[bytes], offset: int) -> tuple[int, int] | None:
-        """Return opcode and length of the record at `offset`, or None when no whole record is there."""
-        stream.seek(offset)
-        header = stream.read(_RECORD_HEADER.size)
-        if len(header) < _RECORD_HEADER.size:
-            return None
-        opcode, length = _RECORD_HEADER.unpack(header)
-        # An opcode of 0 is not in use: it is what a preallocated, never written block reads as.
-        return (opcode, length) if opcode and offset + _RECORD_HEADER.size + length <= self.size else None
+    def _walk(self, stream: IO[bytes], index: _Index, offset: int, stop: int) -> int | None:
+        """Add the records from one byte to another to the index.
 
-    def _intact_records(self, stream: IO[bytes], offset: int) -> list[McapRecord]:
-        """Return what is in the record at `offset`, nothing when it is damaged (which is reported)."""
+        Return where they could not be followed; None where the messages ended, or `stop` was reached within the file.
+        """
+        while offset < stop or stop == self.size:
+            record = record_at(stream, offset, self.size)
+            if record is None:
+                return offset
+            if record.opcode == Opcode.DATA_END:
+                return None
+            self._add_record(stream, index, offset, record)
+            offset = record.end
+        return None
+
+    def _add_record(self, stream: IO[bytes], index: _Index, offset: int, record: Record) -> None:
+        """Add to the index what one record of the file, at `offset`, holds; damage is reported."""
         try:
-            return self._records_at(stream, offset)
-        except _DAMAGE as error:
+            content = content_at(stream, record)
+            if content is None:
+                return
+            messages = messages_in(content)
+            for inner in records_in(content):
+                if inner.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                    self._describe(index, content, inner)
+        except DAMAGE as error:
             self._report(f"chunk at byte {offset} skipped", error)
-            return []
+            return
+        if messages:
+            channels = Counter(message.channel for message in messages)
+            times = [message.log_time for message in messages]
+            index.counts.update(channels)
+            index.blocks.append(Block(min(times), max(times), offset, frozenset(channels)))
 
-    def _records_at(self, stream: IO[bytes], offset: int) -> list[McapRecord]:
-        header = self._record_header(stream, offset)
-        if header is None:
-            raise McapError("no whole record there")
-        opcode, length = header
-        if opcode not in _NEEDED:
-            return []
-        _check_size(length)
-        _check_described(length if opcode in _DESCRIBING else 0)
-        body = ReadDataStream(io.BytesIO(stream.read(length)))
-        if opcode == Opcode.CHUNK:
-            return _chunk_records(Chunk.read(body))
-        if opcode == Opcode.MESSAGE:
-            return [Message.read(body, length)]
-        return [Schema.read(body) if opcode == Opcode.SCHEMA else Channel.read(body)]
+    def _describe(self, index: _Index, content: bytes, record: Record) -> None:
+        """Add a schema or channel to the index; one that cannot be read costs no other."""
+        try:
+            described = parsed(content, record)
+        except DAMAGE as error:
+            self._report(f"description of a {'type' if record.opcode == Opcode.SCHEMA else 'topic'} skipped", error)
+            return
+        _add_description(index, described)
 
-    def _channel_topics(self) -> Iterator[Topic]:
-        """Give a topic for every readable channel; the others are reported."""
-        for id_, count in self._index.counts.items():
-            channel = self._index.channels.get(id_)
-            schema = self._index.schemas.get(channel.schema_id) if channel else None
-            if channel is None or schema is None or channel.message_encoding != "cdr":
+    def _check_total(self, index: _Index, summary: _Summary | None) -> None:
+        """Report when the file's own number of all messages is not that of its topics."""
+        statistics = summary.statistics if summary else None
+        if statistics is not None and statistics.message_count != index.counts.total():
+            self._report(
+                f"{index.counts.total()} messages found, the file itself counts {statistics.message_count} in all"
+            )
+
+    def _set_topics(self, index: _Index) -> None:
+        """Describe every readable channel; the others are reported."""
+        found = dict(self._readable_channels(index))
+        self.topics, names = joined_topics([topic for topic, _ in found.values()])
+        converter = Ros1Converter(self.topics.values())
+        for (id_, (topic, encoding)), name in zip(found.items(), names, strict=True):
+            self._channels[id_] = ReadChannel(name, converter.to_cdr(topic.type) if encoding == "ros1" else None)
+
+    def _readable_channels(self, index: _Index) -> Iterator[tuple[int, tuple[Topic, str]]]:
+        for id_, count in index.counts.items():
+            channel = index.channels.get(id_)
+            schema = index.schemas.get(channel.schema_id) if channel else None
+            if channel is None or schema is None or channel.message_encoding not in ("cdr", "ros1"):
                 what = (
                     f"{channel.topic} (encoding {channel.message_encoding!r})" if channel else f"unknown channel {id_}"
                 )
-                self._report(f"left out {what}: {count} messages are not CDR of a known type")
+                self._report(f"left out {what}: {count} messages are neither CDR nor ROS 1 of a known type")
                 continue
-            definition = schema.data.decode(errors="replace")
-            qos = recorded_qos(channel.metadata.get("offered_qos_profiles"))
-            yield Topic(channel.topic, schema.name, count, qos, definition or None)
+            try:
+                yield id_, (_topic(channel, schema, count), channel.message_encoding)
+            except ValueError as error:
+                self._report(f"left out {channel.topic}: {count} messages", error)
 
 
-def _opened_once(path: Location, opened: ExitStack) -> Callable[[], IO[bytes]]:
-    """Return a function that gives the file's stream, opened when it is first asked for and closed with `opened`."""
+def _topic(channel: Channel, schema: Schema, count: int) -> Topic:
+    """Describe a channel; raises ValueError where the type of its ROS 1 messages cannot be known."""
+    type_ = normal_type_name(schema.name)
+    definition = schema.data.decode(errors="replace")
+    if channel.message_encoding == "ros1":
+        definition = ros1_definition(definition, type_)
+    qos = recorded_qos(channel.metadata.get("offered_qos_profiles"))
+    return Topic(channel.topic, type_, count, qos, definition or None)
 
-    @cache
-    def stream() -> IO[bytes]:
-        return opened.enter_context(path.open("rb"))
 
-    return stream
-
-
-def _is_complete(summary: Summary) -> bool:
-    """Say whether the index repeats all channels and knows all chunks; it may leave both out."""
+def _knows_its_channels(summary: _Summary) -> bool:
+    """Say whether the index repeats all channels and schemas, and all chunks; it may leave both out."""
     statistics = summary.statistics
+    used = {channel for chunk in summary.chunks for channel in chunk.message_index_offsets} | summary.counts.keys()
     return (
-        statistics is not None
-        and len(summary.chunk_indexes) == statistics.chunk_count
-        and len({chunk.chunk_start_offset for chunk in summary.chunk_indexes}) == statistics.chunk_count
-        and (statistics.chunk_count > 0 or statistics.message_count == 0)
-        and statistics.channel_message_counts.keys() <= summary.channels.keys()
+        used <= summary.channels.keys()
         and {channel.schema_id for channel in summary.channels.values()} <= summary.schemas.keys() | {0}
+        and (statistics is None or len(summary.chunks) == statistics.chunk_count)
     )
 
 
-def _index_of(summary: Summary) -> _Index:
-    counts = summary.statistics.channel_message_counts if summary.statistics else {}
-    blocks = [
-        _Block(
-            chunk.message_start_time,
-            chunk.message_end_time,
-            chunk.chunk_start_offset,
-            frozenset(chunk.message_index_offsets),
-            bool(chunk.compression),
-        )
-        for chunk in summary.chunk_indexes
-    ]
-    return _Index(summary.schemas, summary.channels, Counter(counts), blocks)
+def _is_to_be_read(chunk: ChunkIndex, summary: _Summary) -> bool:
+    """Say whether the index leaves open what is in a chunk: topics that nothing else tells, or nothing at all."""
+    seems_empty = chunk.message_start_time == chunk.message_end_time == 0
+    return not chunk.message_index_offsets and (seems_empty or not summary.counts)
 
 
-def _add_records(index: _Index, offset: int, records: list[McapRecord]) -> None:
-    """Add to the index what one record of the file, at `offset`, holds."""
-    messages = []
-    for record in records:
-        if isinstance(record, Schema | Channel):
-            _describe(index, record)
-        elif isinstance(record, Message):
-            messages.append((record.log_time, record.channel_id))
-    if messages:
-        channels = Counter(channel for _, channel in messages)
-        index.counts.update(channels)
-        index.blocks.append(_Block(min(messages)[0], max(messages)[0], offset, frozenset(channels)))
+def _span(chunk: ChunkIndex) -> tuple[int, int]:
+    """Return the bytes of a chunk with the message indexes behind it."""
+    return chunk.chunk_start_offset, chunk.chunk_start_offset + chunk.chunk_length + chunk.message_index_length
 
 
-def _describe(index: _Index, record: Schema | Channel) -> None:
+def _gaps(spans: Sequence[tuple[int, int]], begin: int, end: int) -> Iterator[tuple[int, int]]:
+    """Give the bytes from `begin` to `end` that are in none of the spans, which are sorted."""
+    for start, stop in spans:
+        if start > begin:
+            yield begin, start
+        begin = max(begin, stop)
+    if end > begin:
+        yield begin, end
+
+
+def _block(chunk: ChunkIndex) -> Block:
+    return Block(
+        chunk.message_start_time,
+        chunk.message_end_time,
+        chunk.chunk_start_offset,
+        frozenset(chunk.message_index_offsets),
+        bool(chunk.compression),
+    )
+
+
+def _add_description(index: _Index, record: object) -> None:
     """Add a schema or channel to the index; chunks repeat them, which takes no more memory."""
     if isinstance(record, Schema):
-        known, size = index.schemas.get(record.id) == record, len(record.name) + len(record.data)
-    else:
-        texts = [record.topic, *record.metadata, *record.metadata.values()]
-        known, size = index.channels.get(record.id) == record, sum(map(len, texts))
-    index.described += 0 if known else size
-    _check_described(index.described)
-    if isinstance(record, Schema):
+        index.described += 0 if index.schemas.get(record.id) == record else len(record.name) + len(record.data)
+        check_described(index.described)
         index.schemas[record.id] = record
-    else:
+    elif isinstance(record, Channel):
+        texts = [record.topic, *record.metadata, *record.metadata.values()]
+        index.described += 0 if index.channels.get(record.id) == record else sum(map(len, texts))
+        check_described(index.described)
         index.channels[record.id] = record
         index.counts[record.id] += 0
 
 
-def _records(section: bytes) -> Iterator[McapRecord]:
-    return StreamReader(io.BytesIO(section), skip_magic=True, emit_chunks=True).records
-
-
-def _add_to_summary(summary: Summary, record: McapRecord) -> None:
+def _add_to_summary(summary: _Summary, record: object) -> None:
     if isinstance(record, Statistics):
         summary.statistics = record
     elif isinstance(record, Schema):
@@ -315,54 +316,4 @@ def _add_to_summary(summary: Summary, record: McapRecord) -> None:
     elif isinstance(record, Channel):
         summary.channels[record.id] = record
     elif isinstance(record, ChunkIndex):
-        summary.chunk_indexes.append(record)
-
-
-def _chunk_records(chunk: Chunk) -> list[McapRecord]:
-    _check_size(chunk.uncompressed_size)
-    content = _unpacked(chunk)
-    if len(content) != chunk.uncompressed_size:
-        raise McapError(f"holds {len(content)} bytes, announces {chunk.uncompressed_size}")
-    _check_records(content)
-    return breakup_chunk(replace(chunk, compression="", data=content), validate_crc=True)
-
-
-def unpack_zstd(packed: bytes | memoryview, most: int) -> bytes:
-    """Decompress into no more than `most` bytes, whatever is declared; raises ZstdError."""
-    # The library believes a frame's own size before the limit that it is given.
-    if zstandard.frame_content_size(packed) > most:
-        raise zstandard.ZstdError(f"unpacks to more than {most} bytes")
-    return zstandard.decompress(packed, most)
-
-
-def _unpacked(chunk: Chunk) -> bytes:
-    """Decompress a chunk into no more memory than it announces, whatever is packed in it."""
-    if chunk.compression == "zstd":
-        return unpack_zstd(chunk.data, chunk.uncompressed_size)
-    if chunk.compression == "lz4":
-        unpacked: bytes = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, chunk.uncompressed_size)
-        return unpacked
-    return chunk.data
-
-
-def _check_records(content: bytes | memoryview) -> None:
-    """Refuse to make millions of objects out of one chunk or index."""
-    position = described = 0
-    for _ in range(MAX_BLOCK_RECORDS):
-        if position >= len(content):
-            return
-        opcode, length = _RECORD_HEADER.unpack_from(content, position)
-        position += _RECORD_HEADER.size + length
-        described += length if opcode in _DESCRIBING else 0
-        _check_described(described)
-    raise McapError(f"more than {MAX_BLOCK_RECORDS} records")
-
-
-def _check_described(size: int) -> None:
-    if size > _MAX_DESCRIBED_BYTES:
-        raise McapError(f"topics and types of more than {_MAX_DESCRIBED_BYTES} bytes")
-
-
-def _check_size(length: int) -> None:
-    if length > MAX_BLOCK_BYTES:
-        raise McapError(f"{length} bytes; at most {MAX_BLOCK_BYTES} are read at once")
+        summary.chunks.append(record)

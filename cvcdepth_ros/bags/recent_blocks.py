@@ -5,8 +5,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Hashable, Sequence
-
-from mcap.records import McapRecord, Message
+from typing import NamedTuple
 
 from cvcdepth_ros.recently_used import RecentlyUsed
 
@@ -14,20 +13,30 @@ MESSAGE_BYTES = 256
 """What a message's objects take beside its content."""
 
 
+class StoredMessage(NamedTuple):
+    """One message as a file holds it."""
+
+    channel: int
+    """The file's id of the topic."""
+    log_time: int
+    """ns."""
+    content: bytes
+
+
 class RecentBlocks:
-    """The unpacked records of the blocks that were used last, of all files of a process, up to a number of bytes."""
+    """The unpacked messages of the blocks that were used last, of all files of a process, up to a number of bytes."""
 
     def __init__(self, limit: int) -> None:
-        self._blocks: RecentlyUsed[Hashable, Sequence[McapRecord]] = RecentlyUsed(limit)
+        self._blocks: RecentlyUsed[Hashable, Sequence[StoredMessage]] = RecentlyUsed(limit)
         self._lock = threading.Lock()
 
-    def get(self, key: Hashable) -> Sequence[McapRecord] | None:
-        """Return a block's records, None when they are not kept."""
+    def get(self, key: Hashable) -> Sequence[StoredMessage] | None:
+        """Return a block's messages, None when they are not kept."""
         with self._lock:
             return self._blocks.get(key)
 
-    def put(self, key: Hashable, records: Sequence[McapRecord]) -> None:
-        """Keep a block's records, and drop those that were not used for longest until all fit; too large ones too."""
-        size = sum(MESSAGE_BYTES + (len(r.data) if isinstance(r, Message) else 0) for r in records)
+    def put(self, key: Hashable, messages: Sequence[StoredMessage]) -> None:
+        """Keep a block's messages, and drop those that were not used for longest until all fit; too large ones too."""
+        size = sum(MESSAGE_BYTES + len(message.content) for message in messages)
         with self._lock:
-            self._blocks.put(key, records, size)
+            self._blocks.put(key, messages, size)

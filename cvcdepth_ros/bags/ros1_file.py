@@ -1,57 +1,62 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading of one ROS 1 .bag file; its messages are converted to CDR, its types to their ROS 2 form.
+"""Reading of one ROS 1 .bag file, whole, cut or never closed, see `BlockFile`.
 
-Memory is bounded whatever a file declares: no record is larger than `MAX_BLOCK_BYTES`, a chunk unpacks to what it
-announces, which is no more than that, or not at all, and the index is read once.
+Its messages are converted to CDR, its types to their ROS 2 form.
 """
 
-import bz2
-import io
-import struct
-from collections.abc import Collection, Iterator
-from functools import partial
-from pathlib import Path, PosixPath
-from typing import Any
-
-import lz4.frame  # type: ignore[import-untyped]
-from rosbags.interfaces import Connection, ConnectionExtRosbag1
-from rosbags.rosbag1 import Reader, ReaderError
-from rosbags.rosbag1.reader import Chunk, Header, IndexData
-from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, TypesysError, get_typestore
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, NamedTuple
 
 from cvcdepth_core.errors import RecordingError
-from cvcdepth_ros.bags.topics import (
-    LATCHED,
-    MAX_BLOCK_BYTES,
-    RecordedMessage,
-    RecordingFile,
-    Topic,
-    error_text,
-    joined_topics,
+from cvcdepth_ros.bags.blocks import Block, BlockFile, ReadChannel
+from cvcdepth_ros.bags.definitions import normal_type_name
+from cvcdepth_ros.bags.recent_blocks import StoredMessage
+from cvcdepth_ros.bags.ros1_messages import Ros1Converter, ros1_definition
+from cvcdepth_ros.bags.ros1_records import (
+    DAMAGE,
+    Op,
+    Record,
+    chunk_content,
+    data_of,
+    fields_in,
+    read_record,
+    records_in,
 )
-from cvcdepth_ros.bags.typestores import parsed_definition, typestore, typestore_for
+from cvcdepth_ros.bags.topics import LATCHED, Topic, error_text, joined_topics
 
 MAGIC = b"#ROSBAG V2.0\n"
-# What rosbags and the decompressors raise on damaged bytes. Its reader also asserts, and looks up connections that the
-# file does not have; bz2: EOFError, lz4: RuntimeError.
-_DAMAGE = (
-    ReaderError,
-    SerdeError,
-    AssertionError,
-    LookupError,
-    struct.error,
-    ValueError,
-    EOFError,
-    RuntimeError,
-    OSError,
-    MemoryError,
-)
-# The types that ROS 1 lays out differently (the header has a sequence number there) or has built in.
-_ROS2_TYPES = ("std_msgs/msg/Header", "builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
+_MD5_OF_NOTHING = "d41d8cd98f00b204e9800998ecf8427e"
+_PAIR_BYTES = 8
+# The same message, from before tf2.
+_LATER_NAMES = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
 
 
-class Ros1File(RecordingFile):
+class _Connection(NamedTuple):
+    """What a publisher said of a topic."""
+
+    topic: str
+    type: str
+    md5sum: str
+    definition: str
+    latched: bool
+
+
+@dataclass
+class _Index:
+    """What is known of a file's content."""
+
+    connections: dict[int, _Connection] = field(default_factory=dict)
+    counts: Counter[int] = field(default_factory=Counter)
+    """Messages per connection."""
+    blocks: list[Block] = field(default_factory=list)
+    chunks: int = 0
+    """Entries of the file's own index, also those of chunks without messages."""
+
+
+class Ros1File(BlockFile):
     """One .bag file, see `RecordingFile`."""
 
     path: Path
@@ -59,102 +64,160 @@ class Ros1File(RecordingFile):
     def __init__(self, path: Path) -> None:
         super().__init__(path)
         self.size = path.stat().st_size
+        with path.open("rb") as stream:
+            index = self._indexed(stream)
+            if index is None:
+                self.indexed, index = False, self._scanned(stream)
+            else:
+                self._declared = index.counts
+        self._blocks = index.blocks
+        self._set_span()
+        self._set_topics(index)
+
+    def _intact_messages(self, stream: IO[bytes], offset: int) -> Sequence[StoredMessage]:
         try:
-            with _BoundedReader(path) as reader:
-                self.topics = joined_topics([_topic(connection) for connection in reader.connections], path)
-                empty = reader.message_count == 0
-                self.start = None if empty else reader.start_time
-                self.end = None if empty else reader.end_time - 1
-        except _DAMAGE as error:
-            raise RecordingError(
-                f"{path}: {error_text(error)} (`rosbag reindex` repairs a bag that was cut)"
-            ) from error
-        except TypesysError as error:
-            raise RecordingError(f"{path}: message definition not understood: {error}") from error
-        self._typestore = typestore_for(self.topics.values())
+            record = read_record(stream, offset, self.size)
+            if record is None:
+                raise ValueError("no whole record there")
+            return _messages_in(_inner_records(record, data_of(stream, record)))
+        except DAMAGE as error:
+            self._report(f"chunk at byte {offset} skipped", error)
+            return []
 
-    def messages(self, topics: Collection[str], start: int, stop: int) -> Iterator[RecordedMessage]:
-        """Give the messages of `topics` with start <= log_time < stop, in time order."""
-        count = 0
-        with _BoundedReader(self.path) as reader:
-            wanted = [connection for connection in reader.connections if connection.topic in topics]
+    def _indexed(self, stream: IO[bytes]) -> _Index | None:
+        """Read the index at the end of the file; None when there is none or it does not fit the file."""
+        try:
+            bag = read_record(stream, len(MAGIC), self.size)
+        except DAMAGE as error:
+            raise RecordingError(f"{self.path}: {error_text(error)}") from error
+        if bag is None:
+            return None
+        if bag.fields.get("encryptor"):
+            raise RecordingError(f"{self.path}: is encrypted by {bag.text('encryptor'):.40}")
+        try:
+            position = bag.number("index_pos")
+            return self._index_at(stream, position, bag) if position else None
+        except DAMAGE as error:
+            self._report("index unreadable", error)
+            return None
+
+    def _index_at(self, stream: IO[bytes], position: int, bag: Record) -> _Index:
+        index = _Index()
+        while position < self.size and (record := read_record(stream, position, self.size)) is not None:
+            if record.op == Op.CONNECTION:
+                _add_connection(index, record, data_of(stream, record))
+            elif record.op == Op.CHUNK_INFO:
+                _add_chunk(index, record, data_of(stream, record))
+            position = record.end
+        wanted = bag.number("conn_count"), bag.number("chunk_count")
+        found = len(index.connections), index.chunks
+        if found != wanted:
+            raise ValueError(f"{found[0]} connections and {found[1]} chunks, want {wanted[0]} and {wanted[1]}")
+        if len({block.offset for block in index.blocks}) < len(index.blocks):
+            raise ValueError("it lists chunks more than once: they overlap")
+        return index
+
+    def _scanned(self, stream: IO[bytes]) -> _Index:
+        """Walk through the records from the beginning and index what is whole."""
+        index = _Index()
+        offset, reason = len(MAGIC), ""
+        while offset < self.size:
             try:
-                for connection, log_time, raw in reader.messages(wanted, start, stop) if wanted else ():
-                    cdr = self._typestore.ros1_to_cdr(raw, connection.msgtype)
-                    yield RecordedMessage(connection.topic, log_time, cdr)
-                    count += 1
-            except _DAMAGE as error:
-                self._report(f"reading stopped after {count} messages", error)
+                record = read_record(stream, offset, self.size)
+            except DAMAGE as error:
+                record, reason = None, f" ({error_text(error)})"
+            if record is None:
+                self._report(
+                    f"cut or unreadable from byte {offset} of {self.size} on{reason}, no index: "
+                    f"{index.counts.total()} messages of the {len(index.blocks)} chunks before it recovered"
+                )
+                break
+            self._add_record(stream, index, offset, record)
+            offset = record.end
+        return index
+
+    def _add_record(self, stream: IO[bytes], index: _Index, offset: int, record: Record) -> None:
+        """Add to the index what one record of the file, at `offset`, holds; damage is reported."""
+        if record.op not in (Op.CHUNK, Op.MESSAGE, Op.CONNECTION):
+            return
+        try:
+            records = _inner_records(record, data_of(stream, record))
+            for inner, data in records:
+                if inner.op == Op.CONNECTION:
+                    _add_connection(index, inner, data)
+            messages = _messages_in(records)
+        except DAMAGE as error:
+            self._report(f"chunk at byte {offset} skipped", error)
+            return
+        if messages:
+            times = [message.log_time for message in messages]
+            channels = Counter(message.channel for message in messages)
+            index.counts.update(channels)
+            index.blocks.append(Block(min(times), max(times), offset, frozenset(channels)))
+
+    def _set_topics(self, index: _Index) -> None:
+        """Describe every readable topic; the others are reported."""
+        found: dict[int, Topic] = {}
+        for id_, count in {**dict.fromkeys(index.connections, 0), **index.counts}.items():
+            connection = index.connections.get(id_)
+            try:
+                if connection is None:
+                    raise ValueError("no connection record says what they are")  # noqa: TRY301
+                found[id_] = _topic(connection, count)
+            except ValueError as error:
+                what = connection.topic if connection else f"connection {id_}"
+                self._report(f"left out {what}: {count} messages", error)
+        self.topics, names = joined_topics([*found.values()])
+        converter = Ros1Converter(self.topics.values())
+        for (id_, topic), name in zip(found.items(), names, strict=True):
+            self._channels[id_] = ReadChannel(name, converter.to_cdr(topic.type))
 
 
-class _BoundedReader(Reader):
-    """rosbags' reader, which alone believes whatever sizes a file declares."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__(path)
-        self.path = _BoundedPath(path)
-        self._unread = path.stat().st_size
-
-    def read_chunk(self) -> Chunk:
-        """Read the header of a chunk, which also says to how many bytes it unpacks."""
-        assert self.bio
-        position = self.bio.tell()
-        chunk = super().read_chunk()
-        end = self.bio.tell()
-        self.bio.seek(position)
-        header = Header.read(self.bio)
-        self.bio.seek(end)
-        unpack = partial(_unpacked, position, header.get_string("compression"), header.get_uint32("size"))
-        return chunk._replace(decompressor=unpack)
-
-    def read_index_data(self, pos: int, indexes: dict[int, list[IndexData]]) -> None:
-        """Read a record of the index; chunks that lead to each other's would make millions of entries out of one."""
-        assert self.bio
-        position = self.bio.tell()
-        super().read_index_data(pos, indexes)
-        self._unread -= self.bio.tell() - position
-        if self._unread < 0:
-            raise ReaderError("the records of the index are larger than the file: they overlap")
+def _inner_records(record: Record, data: bytes) -> list[tuple[Record, bytes]]:
+    """Return the records of a chunk with their data; a record that is no chunk holds only itself."""
+    if record.op != Op.CHUNK:
+        return [(record, data)]
+    content = chunk_content(record, data)
+    return [(inner, content[inner.start : inner.end]) for inner in records_in(content)]
 
 
-class _BoundedPath(PosixPath):
-    """A path whose file gives at most `MAX_BLOCK_BYTES` at once."""
-
-    def open(self, *_: Any) -> "_BoundedFile":  # type: ignore[override]
-        return _BoundedFile(super().open("rb", buffering=0))
-
-
-class _BoundedFile(io.BufferedReader):
-    def read(self, size: int | None = -1) -> bytes:
-        if size is None or not 0 <= size <= MAX_BLOCK_BYTES:
-            where = f"record of {size} bytes at byte {self.tell()}"
-            raise ValueError(f"{where}; at most {MAX_BLOCK_BYTES} are read at once")  # rosbags replaces its own errors
-        return super().read(size)
+def _messages_in(records: Sequence[tuple[Record, bytes]]) -> list[StoredMessage]:
+    return [
+        StoredMessage(record.number("conn"), record.time("time"), data)
+        for record, data in records
+        if record.op == Op.MESSAGE
+    ]
 
 
-def _unpacked(position: int, compression: str, size: int, packed: bytes) -> bytes:
-    """Decompress a chunk into no more memory than it announces, whatever is packed in it."""
-    if size > MAX_BLOCK_BYTES:
-        raise ReaderError(f"chunk at byte {position}: {size} bytes; at most {MAX_BLOCK_BYTES} are read at once")
-    content = packed
-    if compression == "bz2":
-        content = bz2.BZ2Decompressor().decompress(packed, size + 1)
-    elif compression == "lz4":
-        content = lz4.frame.LZ4FrameDecompressor().decompress(packed, size + 1)
-    if len(content) != size:
-        raise ReaderError(f"chunk at byte {position} does not hold the {size} bytes that it announces")
-    return content
+def _add_connection(index: _Index, record: Record, data: bytes) -> None:
+    said = Record(fields_in(data), 0, 0)
+    # The topic of the record's own header is the one that was subscribed to.
+    topic = record.text("topic") or said.text("topic")
+    parts = [part for part in topic.split("/") if part]
+    name = "/" * topic.startswith("/") + "/".join(parts)
+    type_, definition = normal_type_name(said.text("type")), said.text("message_definition")
+    type_ = _LATER_NAMES.get(type_, type_)
+    latched = said.text("latching") == "1"
+    index.connections[record.number("conn")] = _Connection(name, type_, said.text("md5sum"), definition, latched)
 
 
-def _topic(connection: Connection) -> Topic:
-    types = parsed_definition(connection.msgdef.data, connection.msgtype)
-    if connection.msgtype not in types:
-        raise TypesysError(
-            f"that of {connection.msgtype}, which is not complete, has elements without bytes, or is none"
-        )
-    types.update({name: typestore().fielddefs[name] for name in _ROS2_TYPES})
-    store = get_typestore(Stores.EMPTY)
-    store.register(types)
-    definition, _ = store.generate_msgdef(connection.msgtype, ros_version=2)
-    latched = isinstance(connection.ext, ConnectionExtRosbag1) and bool(connection.ext.latching)
-    return Topic(connection.topic, connection.msgtype, connection.msgcount, (LATCHED,) if latched else None, definition)
+def _add_chunk(index: _Index, record: Record, data: bytes) -> None:
+    """Add what a chunk info record says: where the chunk is, when it begins and ends, how many messages it has."""
+    pairs = range(0, min(record.number("count") * _PAIR_BYTES, len(data)), _PAIR_BYTES)
+    counts = {
+        int.from_bytes(data[at : at + 4], "little"): int.from_bytes(data[at + 4 : at + 8], "little") for at in pairs
+    }
+    index.chunks += 1
+    index.counts.update(counts)
+    if not counts:
+        return
+    start, end = record.time("start_time"), record.time("end_time")
+    index.blocks.append(Block(start, end, record.number("chunk_pos"), frozenset(counts)))
+
+
+def _topic(connection: _Connection, count: int) -> Topic:
+    """Describe a topic; raises ValueError where its type cannot be known."""
+    # The definition of a type without fields is empty, and so is one that is missing; the sum tells the two apart.
+    is_empty = connection.md5sum == _MD5_OF_NOTHING
+    definition = ros1_definition(connection.definition or "\n" * is_empty, connection.type)
+    return Topic(connection.topic, connection.type, count, (LATCHED,) if connection.latched else None, definition)

@@ -5,10 +5,12 @@ import sqlite3
 import sys
 from collections.abc import Collection, Iterator
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from urllib.parse import quote
 
 from cvcdepth_core.errors import RecordingError
+from cvcdepth_ros.bags.definitions import normal_type_name
 from cvcdepth_ros.bags.topics import (
     MAX_BLOCK_BYTES,
     RecordedMessage,
@@ -39,7 +41,7 @@ class SqliteFile(RecordingFile):
             with closing(self._connect()) as database:
                 _check_tables(database)
                 self._names = self._readable_names(database)
-                self.topics = joined_topics([*self._read_topics(database)], path)
+                self._set_topics(database)
                 self.start, self.end = database.execute(
                     "SELECT MIN(timestamp), MAX(timestamp) FROM messages"
                 ).fetchone()
@@ -83,6 +85,8 @@ class SqliteFile(RecordingFile):
         if leftover:
             database.execute("PRAGMA locking_mode=EXCLUSIVE")
         database.execute("PRAGMA trusted_schema=OFF")
+        # Comments of definitions are of any character set.
+        database.text_factory = partial(str, encoding="utf-8", errors="replace")
         if sys.version_info >= (3, 11):  # for names and definitions; Python 3.10 leaves SQLite's own limit, 1 GB
             database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_BLOCK_BYTES)
         return database
@@ -98,14 +102,20 @@ class SqliteFile(RecordingFile):
                 self._report(f"left out {name}: serialization format {encoding!r} is not cdr")
         return names
 
-    def _read_topics(self, database: sqlite3.Connection) -> Iterator[Topic]:
+    def _set_topics(self, database: sqlite3.Connection) -> None:
+        found = dict(self._read_topics(database))
+        self.topics, names = joined_topics([*found.values()])
+        self._names = dict(zip(found, names, strict=True))
+
+    def _read_topics(self, database: sqlite3.Connection) -> Iterator[tuple[int, Topic]]:
         counts = dict(database.execute("SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id"))
         definitions = _definitions(database)
         qos = "offered_qos_profiles" if "offered_qos_profiles" in _columns(database, "topics") else "NULL"
         for id_, type_, profiles in database.execute(f"SELECT id, type, {qos} FROM topics ORDER BY id"):
             if id_ in self._names and isinstance(type_, str):
                 qos_text = profiles if isinstance(profiles, str) else None
-                yield Topic(self._names[id_], type_, counts.get(id_, 0), recorded_qos(qos_text), definitions.get(type_))
+                type_name, definition = normal_type_name(type_), definitions.get(type_)
+                yield id_, Topic(self._names[id_], type_name, counts.get(id_, 0), recorded_qos(qos_text), definition)
 
 
 def _check_tables(database: sqlite3.Connection) -> None:

@@ -18,11 +18,12 @@ from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.rig.rig_file import RigLayout
 from cvcdepth_core.stamps import exposure_times
 from cvcdepth_ros.bags import RecordedMessage, Recording
+from cvcdepth_ros.messages.camera_discovery import RECORDED_IMAGE_TYPES
 from cvcdepth_ros.messages.conversion import picture_from_message
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
 from cvcdepth_ros.recordings.motion import VehicleMotion, find_motion_link
 from cvcdepth_ros.recordings.refusals import Refusals
-from cvcdepth_ros.recordings.rig import IMAGE_TYPES, chosen_layout
+from cvcdepth_ros.recordings.rig import chosen_layout
 from cvcdepth_ros.recordings.rig_messages import RigMessages
 from cvcdepth_ros.recordings.topic_timing import TopicTiming
 from cvcdepth_ros.settings import MatchingSettings
@@ -99,8 +100,8 @@ class CheckContext:
         """None where the cameras make no rig, or the transforms contradict each other."""
         self.lidars = messages.lidars if options.lidar is None else options.lidar
         """The topics of the LiDARs."""
-        self.camera_clouds = messages.camera_clouds if options.lidar is None else ()
-        """Topics with clouds that were made from camera images."""
+        self.other_clouds = messages.other_clouds if options.lidar is None else {}
+        """By topic, why its clouds are no LiDAR's."""
         self.motion = self._found_motion()
         self.refused_motion = Refusals()
         """Impossible poses."""
@@ -211,7 +212,7 @@ class CheckContext:
 
     def _cameras_by_topic(self) -> dict[str, list[str]]:
         found: dict[str, list[str]] = defaultdict(list)
-        images = {topic.name for topic in self.recording.topics.values() if topic.type in IMAGE_TYPES}
+        images = {topic.name for topic in self.recording.topics.values() if topic.type in RECORDED_IMAGE_TYPES}
         for camera in self.assembler.layout.cameras if self.assembler else ():
             if camera.image_topic in images:
                 found[camera.image_topic].append(camera.name)

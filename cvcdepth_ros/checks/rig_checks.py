@@ -3,22 +3,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 
-from cvcdepth_ros.bags import Recording
 from cvcdepth_ros.checks.context import CheckContext, CheckResult
+from cvcdepth_ros.messages.recorded_cameras import find_recorded_cameras
+from cvcdepth_ros.messages.recorded_changes import find_calibration_changes
 from cvcdepth_ros.messages.transforms import frame_name
 from cvcdepth_ros.recordings.fixed_frames import MOVING_TRANSFORMS
-from cvcdepth_ros.recordings.rig import (
-    IMAGE_TYPES,
-    is_of_depth,
-    recorded_cameras,
-    topic_problems,
-    topics_without_images,
-)
+from cvcdepth_ros.recordings.rig import topic_problems
 from cvcdepth_ros.recordings.rig_messages import STATIC_TRANSFORMS
 
-_INFO = "camera_info"
 _MAX_LISTED = 2
 
 
@@ -30,25 +24,30 @@ def check_cameras(context: CheckContext) -> CheckResult:
         problems = [*topic_problems(recording, layout)]
         remedy = "correct the topics in the rig file; `cvcdepth inspect` lists those recorded"
         return _judged(problems, remedy, f"{len(layout.names)} of the rig file: {', '.join(layout.names)}")
-    names = [camera.name for camera in recorded_cameras(recording)]
+    cameras = find_recorded_cameras(recording)
+    names = [camera.name for camera in cameras.cameras]
     found = f"{len(names)} found: {', '.join(names)}" if names else "none found"
     values = {
         "cameras": names,
-        "without_images": [*topics_without_images(recording)],
-        "without_camera_info": [*_unknown(recording)],
+        "without_images": cameras.without_images,
+        "without_camera_info": cameras.without_info,
+        "choices": cameras.choices,
+        "left_out": cameras.left_out,
     }
     if values["without_images"]:
         remedy = "record its images, or give a rig file without this camera (--rig)"
         return CheckResult("failed", f"{found}; no image beside {', '.join(values['without_images'])}", remedy, values)
     if context.refusal is not None:
         remedy = "record a camera_info beside the images of at least two cameras, in one namespace each"
+        remedy += cameras.offers and f"; {cameras.offers}"
         reason = "two are needed" if len(names) < 2 else context.refusal
         return CheckResult("failed", f"{found}; {reason}", remedy, values)
     if values["without_camera_info"]:
-        remedy = "record its camera_info, or give its calibration in a rig file (--rig)"
+        remedy = cameras.offers or "record its camera_info, or give its calibration in a rig file (--rig)"
         finding = f"{found}; no camera_info beside {', '.join(values['without_camera_info'])}"
         return CheckResult("warning", finding, remedy, values)
-    return CheckResult("passed", found, values=values)
+    told = "; ".join([*cameras.choices, *cameras.left_out][:_MAX_LISTED])
+    return CheckResult("passed", f"{found}; {told}" if told else found, values=values)
 
 
 def check_camera_infos(context: CheckContext) -> CheckResult:
@@ -69,7 +68,12 @@ def check_camera_infos(context: CheckContext) -> CheckResult:
                 problems.append(f"camera {camera}: images of {seen}, but the calibration is for {sizes[camera]}")
     distinct = ", ".join(dict.fromkeys(sizes.values()))
     remedy = "calibrate the camera at the size that is recorded, or correct camera_info or the rig file"
-    return _judged(problems, remedy, f"{len(sizes)} valid, of the images' size ({distinct})", {"sizes": sizes})
+    found = f"{len(sizes)} valid, of the images' size ({distinct})"
+    changes = [] if problems or context.has_rig_file else find_calibration_changes(context.recording, assembler.layout)
+    if changes:
+        remedy = "take the parts before and after as two recordings"
+        return CheckResult("warning", f"{found}; {'; '.join(changes[:_MAX_LISTED])}", remedy, {"changes": changes})
+    return _judged(problems, remedy, found, {"sizes": sizes})
 
 
 def check_transforms(context: CheckContext) -> CheckResult:
@@ -87,7 +91,8 @@ def check_transforms(context: CheckContext) -> CheckResult:
         passed += f" (on {MOVING_TRANSFORMS}, where they do not move: {', '.join(assembler.frames_on_tf)})"
     if not frames:
         remedy = f"record {STATIC_TRANSFORMS}, or give base_T_camera for every camera in a rig file (--rig)"
-        problems = [f"nothing on {STATIC_TRANSFORMS}"] if problems else []
+        about = assembler.about_transforms and f"; {assembler.about_transforms}"
+        problems = [f"nothing on {STATIC_TRANSFORMS}{about}"] if problems else []
     elif frame_name(base_frame) not in frames:
         remedy = (
             f"name the vehicle's frame (--base-frame, or base_frame in the rig file); there are {', '.join(frames)}"
@@ -105,7 +110,8 @@ def check_encodings(context: CheckContext) -> CheckResult:
     pictures = context.pictures
     problems = [picture for picture in pictures.values() if isinstance(picture, str)]
     problems += [f"camera {name}: no image" for name in context.assembler.layout.names if name not in pictures]
-    remedy = "record raw images (rgb8, bgr8, mono8, bayer_*) or CompressedImage with whole JPEG or PNG files"
+    raw = "rgb8, bgr8, mono8, bayer_*, yuv422, nv12"
+    remedy = f"record raw images ({raw}) or CompressedImage with whole JPEG or PNG files"
     return _judged(problems, remedy, f"the first image of {len(pictures)} cameras is decoded")
 
 
@@ -119,12 +125,3 @@ def _judged(problems: list[str], remedy: str, passed: str, values: Mapping[str, 
 
 def _without_cameras() -> CheckResult:
     return CheckResult("skipped", "needs at least two cameras and transforms without contradictions")
-
-
-def _unknown(recording: Recording) -> Iterator[str]:
-    """Yield the image topics without a camera_info in their namespace."""
-    known = tuple(camera.camera_info_topic.removesuffix(_INFO) for camera in recorded_cameras(recording))
-    for topic in recording.topics.values():
-        is_picture = topic.type in IMAGE_TYPES and not is_of_depth(topic.name)
-        if is_picture and topic.count and not topic.name.startswith(known):
-            yield topic.name

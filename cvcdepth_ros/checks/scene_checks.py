@@ -16,10 +16,11 @@ from cvcdepth_core.rig.rig import Camera, Rig
 from cvcdepth_core.rig_health.own_body import lane_share
 from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_ros.checks.context import CheckContext, CheckResult, Status
+from cvcdepth_ros.messages.cloud_sources import describe_left_out_clouds
 from cvcdepth_ros.messages.conversion import stamp_ns
 from cvcdepth_ros.messages.transforms import TransformTree
 from cvcdepth_ros.recordings.lidar import LidarSweeps
-from cvcdepth_ros.recordings.rig_messages import cloud_topics, describe_camera_clouds
+from cvcdepth_ros.recordings.rig_messages import cloud_topics
 from cvcdepth_ros.settings import LIDAR_TOLERANCE
 
 _NEEDS_RIG = CheckResult("skipped", "needs all cameras with calibration and transform")
@@ -137,9 +138,9 @@ def _with_refusals(result: CheckResult, refusals: Sequence[str]) -> CheckResult:
 
 
 def _with_left_out(context: CheckContext, result: CheckResult) -> CheckResult:
-    if not context.camera_clouds:
+    if not context.other_clouds:
         return result
-    finding = describe_camera_clouds(context.camera_clouds)
+    finding = describe_left_out_clouds(context.other_clouds)
     return _worsened(result, finding, "name the LiDARs with --lidar, and nothing else is looked at")
 
 

@@ -51,6 +51,8 @@ class Checked(NamedTuple):
     damage: str | None
     unreadable: str | None
     """Why there are no results."""
+    notes: Sequence[str] = ()
+    """What is odd about the recording, and how it was understood."""
 
     @property
     def failed(self) -> list[str]:
@@ -111,7 +113,9 @@ def _checked(location: "Location", layout: "RigLayout | None", arguments: argpar
             )
             with recording_progress(recording, window, arguments.quiet) as progress:
                 context = CheckContext(recording, options, layout, progress)
-            return Checked(str(location), run_checks(context, arguments.skip), recording.damage, None)
+            results = run_checks(context, arguments.skip)
+            notes = [*recording.notes, *(context.assembler.notes if context.assembler else [])]
+            return Checked(str(location), results, recording.damage, None, notes)
     except CvcDepthError as error:
         return Checked(str(location), [], None, str(error))
 
@@ -123,6 +127,7 @@ def _json(checked: Checked) -> dict[str, Any]:
         "checks": [{"number": number, "name": name, **asdict(result)} for number, name, result in checked.results],
         "counts": dict(counts),
         "damage": checked.damage,
+        "notes": list(checked.notes),
         "unreadable": checked.unreadable,
     }
 
@@ -131,6 +136,8 @@ def _text(checked: Checked) -> str:
     lines = [checked.recording, *(line for result in checked.results for line in _lines(result))]
     if checked.damage:
         lines += _wrapped("    damage", checked.damage)
+    for note in checked.notes:
+        lines += _wrapped("    note", note)
     if checked.unreadable:
         return f"{checked.recording}\n{''.join(_wrapped('    unreadable', checked.unreadable))}"
     return "\n".join([*lines, f"    {_verdict(checked)}"])

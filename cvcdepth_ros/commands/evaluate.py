@@ -198,15 +198,16 @@ def _comparison(first: Path, second: Path) -> tuple[dict[str, Any], str]:
 
 
 def _warn_of_losses(job: EvaluationJob, scores: "RecordingScores") -> None:
-    from cvcdepth_ros.recordings.rig_messages import describe_camera_clouds
 
     damage, sets = scores.summary["damage"], scores.summary["sets"]["scored"]
     if damage:
         seconds = scores.summary["seconds"]
         warn(f"{job.path}: not everything could be read: {damage}; evaluated {sets} sets of the {seconds:.1f} s there")
-    left_out = scores.summary["clouds_of_cameras"]
+    for note in scores.summary.get("notes", ()):
+        warn(f"{job.path}: {note}")
+    left_out = scores.summary.get("why_no_lidar")
     if left_out:
-        warn(f"{job.path}: {describe_camera_clouds(left_out)}")
+        warn(f"{job.path}: {left_out}")
     refusals = scores.summary["truth_refused"]
     if refusals["count"]:
         warn(f"{job.path}: {refusals['count']} times no truth, the first: {refusals['reasons'][0]}")

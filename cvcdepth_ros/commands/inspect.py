@@ -70,7 +70,8 @@ def _summary(location: "Location", arguments: argparse.Namespace) -> "RecordingS
     with open_recording(location) as recording:
         window = window_ns(arguments, recording.start)
         with recording_progress(recording, window, arguments.quiet) as progress:
-            return summarize(recording, *window, progress)
+            # Without --start, also what was recorded before the clock was set.
+            return summarize(recording, window[0] if arguments.start else None, window[1], progress)
 
 
 def _json(summary: "RecordingSummary") -> dict[str, Any]:
@@ -107,7 +108,8 @@ _INDEX: dict["IndexState", str] = {
 
 
 def _damage(summary: "RecordingSummary") -> Iterable[str]:
-    return [f"  {part}" for part in (summary.damage or "").split("; ") if part]
+    damage = [f"  {part}" for part in (summary.damage or "").split("; ") if part]
+    return [*damage, *(f"  note: {note}" for note in summary.notes)]
 
 
 def _topics(topics: Sequence["TopicSummary"]) -> str:
@@ -147,6 +149,7 @@ def _cameras(cameras: Sequence["CameraSummary"]) -> str:
         return "no cameras: a camera is a namespace with a camera_info and an image topic"
     rows = [_camera_row(camera) for camera in cameras]
     problems = [f"  {camera.problem}" for camera in cameras if camera.problem]
+    problems += [f"  camera {camera.name}: camera_info: {note}" for camera in cameras for note in camera.notes]
     return "\n".join([table(("camera", "size", "distortion", "frame", "images"), rows), *problems])
 
 

@@ -60,6 +60,8 @@ def execute(arguments: argparse.Namespace) -> None:
             result = _play(recording, arguments)
         finally:
             rclpy.shutdown()
+        for note in recording.notes:
+            warn(note)
         if recording.damage:
             warn(f"not everything could be read: {recording.damage}")
     print_result(result, _text(result), arguments.json)

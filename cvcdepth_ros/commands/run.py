@@ -86,6 +86,7 @@ def execute(arguments: argparse.Namespace) -> None:
             "configuration": _configuration(arguments, settings, replay),
             **outcome,
             "damage": recording.damage,
+            "notes": replay.notes,
         }
     write_json(arguments.output / _RESULT_FILE, result)
     print_result(result, _text(result), arguments.json)
@@ -216,6 +217,7 @@ def _text(result: dict[str, Any]) -> str:
             table(("camera", "images", "matched", "dropped"), cameras),
             *(f"refused: {reason}" for reason in result["refused"]),
             *([f"not everything could be read: {result['damage']}"] if result["damage"] else []),
+            *(f"note: {note}" for note in result["notes"]),
             f"{sets['written']} sets written of {sets['matched']} matched; {sets['incomplete']} incomplete, "
             f"{sets['refused']} refused",
             f"{seconds['total']:.1f} s: {stages}",

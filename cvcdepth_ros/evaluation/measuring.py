@@ -28,6 +28,7 @@ from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_core.visualization import Points
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.evaluation.job import EvaluationJob
+from cvcdepth_ros.messages.cloud_sources import describe_left_out_clouds
 from cvcdepth_ros.recordings.replay import DepthReplay, RecordedImage, SurroundReplay
 from cvcdepth_ros.recordings.rig import RecordedRig
 from cvcdepth_ros.recordings.truth import RecordedTruth
@@ -285,6 +286,7 @@ def _summary(evaluation: RecordingEvaluation, scoring: _Scoring) -> dict[str, An
         "seconds": (recording.end - recording.start) / NANOSECONDS,
         "lidar": list(truth.topics),
         "clouds_of_cameras": list(truth.left_out),
+        "why_no_lidar": describe_left_out_clouds(truth.left_out) if truth.left_out else "",
         "motion": truth.motion.topic if truth.motion else None,
         "sets": {
             "scored": scoring.sets,
@@ -297,6 +299,7 @@ def _summary(evaluation: RecordingEvaluation, scoring: _Scoring) -> dict[str, An
         "refused": depths.refused.reasons + replay.unreadable.reasons,
         "truth_refused": {"count": truth.refused.count, "reasons": truth.refused.reasons[:10]},
         "damage": recording.damage,
+        "notes": replay.notes,
     }
 
 

@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cvcdepth_core.errors import ConfigError, ImageError, RigError
+from cvcdepth_core.errors import ConfigError, ImageError
 from cvcdepth_core.images.decoding import Picture, Reduction, decode_compressed, decode_raw, reduce_picture
-from cvcdepth_core.rig.calibration import Calibration, calibration_from_fields
+from cvcdepth_core.rig.calibration import Calibration
 from cvcdepth_core.rig.poses import Pose, quaternion_from_rotation
 from cvcdepth_core.stamps import NANOSECONDS
+from cvcdepth_ros.messages.camera_info import read_camera_info
 
 _FLOAT32_DATATYPE = 7  # sensor_msgs/PointField.FLOAT32
 _MILLIMETRES = 1000.0
-_MAX_COEFFICIENTS = 100
 _BIG_ENDIAN_HOST = sys.byteorder == "big"
 
 
@@ -52,23 +52,8 @@ def picture_from_message(
 
 
 def calibration_from_message(message: Any, camera: str) -> Calibration:
-    """Validate a `sensor_msgs/CameraInfo`; RigError names the camera and the first impossible field."""
-    if len(message.d) > _MAX_COEFFICIENTS:
-        raise RigError(f"camera {camera}: camera_info: {len(message.d)} numbers in d; no model takes so many")
-    region = message.roi
-    return calibration_from_fields(
-        camera,
-        {
-            "width": int(message.width),
-            "height": int(message.height),
-            "distortion_model": message.distortion_model,
-            **{field: [float(number) for number in getattr(message, field)] for field in "dkrp"},
-            # CameraInfo.msg: a binning of 0 means 1.
-            "binning_x": int(message.binning_x) or 1,
-            "binning_y": int(message.binning_y) or 1,
-            "roi": {name: int(getattr(region, name)) for name in ("x_offset", "y_offset", "width", "height")},
-        },
-    )
+    """Validate a `sensor_msgs/CameraInfo`, see `read_camera_info`."""
+    return read_camera_info(message, camera).calibration
 
 
 class MessageFactory:

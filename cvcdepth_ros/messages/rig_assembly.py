@@ -9,8 +9,13 @@ from cvcdepth_core.rig.calibration import Calibration
 from cvcdepth_core.rig.poses import Pose
 from cvcdepth_core.rig.rig import Camera, Rig, order_around_vehicle
 from cvcdepth_core.rig.rig_file import CameraEntry, PoseEntry, RigLayout
-from cvcdepth_ros.messages.conversion import calibration_from_message
+from cvcdepth_ros.messages.calibration_changes import describe_change
+from cvcdepth_ros.messages.camera_info import is_uncalibrated, read_camera_info
+from cvcdepth_ros.messages.conversion import stamp_ns
 from cvcdepth_ros.messages.transforms import TransformTree
+
+_MOST_CHANGES = 100  # a lens that zooms or focuses changes for ever
+_LATE = "the first ones cannot be used (drivers send zeros until they have read their file), the later ones are"
 
 
 class RigAssembler:
@@ -22,17 +27,34 @@ class RigAssembler:
         self.transforms = TransformTree() if transforms is None else transforms
         self.frames_on_tf: list[str] = []
         """Sensor frames whose fixed poses a recording told on `/tf`, not `/tf_static`."""
+        self.about_transforms = ""
+        """On which topics a recording has transforms, where these are not the usual ones."""
+        self.changes: list[tuple[int, str]] = []
+        """When (stamp, ns) a CameraInfo was not what the camera's former ones were, and what changed. Not all."""
         self._calibrations: dict[str, Calibration] = {}
         self._frame_ids: dict[str, str] = {}
         self._refused: dict[str, str] = {}
+        self._stamps: dict[str, int] = {}
+        self._notes: dict[str, tuple[str, ...]] = {}
+        self._late: set[str] = set()
+
+    @property
+    def notes(self) -> list[str]:
+        """What is not said as it should be, of CameraInfos and transforms, and how it is understood, a line each."""
+        of_cameras = [(camera, note) for camera, notes in self._notes.items() for note in notes]
+        told = [f"camera {camera}: camera_info: {note}" for camera, note in of_cameras]
+        return [*told, *([self.about_transforms] if self.about_transforms else [])]
 
     def add_camera_info(self, camera: str, message: Any) -> bool:
         """Take over a camera's CameraInfo; return whether it says anything new that the rig file leaves open.
 
         An impossible one is not raised but remembered as the camera's problem, and replaces what was known before:
-        a camera that calls itself uncalibrated must not be used with yesterday's numbers.
+        a camera that calls itself uncalibrated must not be used with yesterday's numbers. But where it was not
+        calibrated yet, before what is known, that says nothing: drivers send zeros until they have read their file.
         """
         entry = self._entry(camera)
+        if is_uncalibrated(message) and stamp_ns(message) < self._stamps.get(camera, 0):
+            return False
         is_renamed = entry.frame_id is None and self._frame_ids.get(camera) != message.header.frame_id
         self._frame_ids[camera] = message.header.frame_id
         is_recalibrated = entry.calibration is None and self._add_calibration(camera, message)
@@ -40,16 +62,24 @@ class RigAssembler:
 
     def _add_calibration(self, camera: str, message: Any) -> bool:
         try:
-            calibration = calibration_from_message(message, camera)
+            calibration, notes = read_camera_info(message, camera)
         except RigError as error:
             self._calibrations.pop(camera, None)
+            self._notes.pop(camera, None)
             is_new = self._refused.get(camera) != str(error)
             self._refused[camera] = str(error)
             return is_new
-        self._refused.pop(camera, None)
-        is_new = self._calibrations.get(camera) != calibration
+        refused = self._refused.pop(camera, None)
+        if refused and camera not in self._stamps:
+            self._late.add(camera)
+        self._notes[camera] = (*((_LATE,) if camera in self._late else ()), *notes)
+        self._stamps.setdefault(camera, stamp_ns(message))
+        known = self._calibrations.get(camera)
         self._calibrations[camera] = calibration
-        return is_new
+        change = describe_change(known, calibration) if known is not None else None
+        if change and len(self.changes) < _MOST_CHANGES:
+            self.changes.append((stamp_ns(message), f"camera {camera}: its calibration changes: {change}"))
+        return known != calibration
 
     def frame_id(self, camera: str) -> str | None:
         """Return the camera's optical frame: the rig file's, else CameraInfo's, None while neither is known."""
@@ -83,7 +113,7 @@ class RigAssembler:
         try:
             self.pose(camera)
         except TransformError as error:
-            return f"camera {camera}: {error}"
+            return f"camera {camera}: {error}{self.about_transforms and f'; {self.about_transforms}'}"
         return None
 
     def pose(self, camera: str) -> Pose:

@@ -18,6 +18,8 @@ from cvcdepth_core.rig.poses import Pose, check_rigid, inverse, pose_from_quater
 _SMALL_ANGLE = 1e-6
 # Keyframes at 2 Hz pass, with jitter. A car in a bend (15 m/s, 0.3 rad/s) is then 0.2 m off the line between two poses.
 _LONGEST_GAP = 0.6
+# Noise of rounding, and no more.
+_SAME_METRES, _SAME_DEGREES = 1e-3, 0.06
 
 
 MAX_FRAMES = 5000
@@ -70,8 +72,11 @@ class TransformTree:
             raise TransformError(f"transform {parent} <- {child} closes a loop: {' <- '.join(self.ancestors(parent))}")
         self._parents[child] = parent, np.array(parent_T_child, dtype=np.float64)
 
-    def add_message(self, message: Any) -> None:
+    def add_message(self, message: Any, moment: str = "") -> None:
         """Add the transforms of a `tf2_msgs/TFMessage`.
+
+        Where the `moment` is told, it is a recording's, and one that was told before with another pose is refused: all
+        of the recording is to be seen with one tree. Without, it is renewed.
 
         Raises TransformError for the first that cannot be added, as in `add` or for a bad quaternion, when all others
         have been: who publishes all of a vehicle's transforms in one message must not lose them to a single one.
@@ -80,11 +85,27 @@ class TransformTree:
         for link in message.transforms:
             try:
                 _, parent, child, parent_T_child = link_of(link)
+                if moment:
+                    self._refuse_if_moved(parent, child, parent_T_child, moment)
                 self.add(parent, child, parent_T_child)
             except TransformError as error:
                 errors.append(error)
         if errors:
             raise errors[0]
+
+    def _refuse_if_moved(self, parent: str, child: str, parent_T_child: Pose, moment: str) -> None:
+        known, known_T_child = self._parents.get(child, ("", parent_T_child))
+        if known != parent:
+            return
+        change = inverse(known_T_child) @ parent_T_child
+        metres = float(np.linalg.norm(change[:3, 3]))
+        sine = float(np.linalg.norm(quaternion_from_rotation(change[:3, :3])[:3]))
+        degrees = np.degrees(2 * np.arcsin(min(1.0, sine)))
+        if metres > _SAME_METRES or degrees > _SAME_DEGREES:
+            self.refused[child] = (
+                f"{parent} <- {child} moves {moment} by {metres:.3f} m and {degrees:.2f} degrees; take the parts "
+                "before and after that as two recordings, or give the poses in a rig file"
+            )
 
     def lookup(self, target_frame: str, source_frame: str) -> Pose:
         """Return target_T_source [4, 4], which takes points of the source frame to the target frame.
@@ -108,7 +129,15 @@ class TransformTree:
                 f"no transform {target} <- {source}: '{target}' hangs from '{target_root}', '{source}' from "
                 f"'{source_root}', and nothing connects the two; known are {known}"
             )
+        for frame in self._between(target, source):
+            if frame in self.refused:
+                raise TransformError(f"no transform {target} <- {source}: {self.refused[frame]}")
         return inverse(root_T_target) @ root_T_source
+
+    def _between(self, target: str, source: str) -> list[str]:
+        """Return the frames whose links lead from one frame to the other."""
+        ends = self.ancestors(target), self.ancestors(source)
+        return [frame for chain in ends for frame in chain if frame not in ends[0] or frame not in ends[1]]
 
     def ancestors(self, frame: str) -> list[str]:
         """Return the frame itself, its parent, and so on up to the root."""

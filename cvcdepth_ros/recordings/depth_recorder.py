@@ -11,8 +11,9 @@ from cvcdepth_core.rig.poses import Pose
 from cvcdepth_ros.bags import RecordedMessage, RecordingWriter
 from cvcdepth_ros.messages.conversion import bag_message_factory
 from cvcdepth_ros.messages.point_clouds import POINT_CLOUD_TYPE
+from cvcdepth_ros.messages.transform_topics import moving_transform_topics
 from cvcdepth_ros.messages.transforms import TransformTree, frame_name
-from cvcdepth_ros.recordings.fixed_frames import MOVING_TRANSFORMS, TRANSFORM_TYPE, has_transforms
+from cvcdepth_ros.recordings.fixed_frames import MOVING_TRANSFORMS, TRANSFORM_TYPE
 from cvcdepth_ros.recordings.replay import Handlers, RecordedImage, SurroundReplay
 from cvcdepth_ros.recordings.rig_messages import STATIC_TRANSFORMS
 from cvcdepth_ros.settings import OutputSettings
@@ -74,13 +75,14 @@ class DepthRecorder:
 
     def _moving_transforms(self) -> Handlers:
         recording = self._replay.recording
-        if not has_transforms(recording, MOVING_TRANSFORMS):
+        topics = moving_transform_topics(recording)
+        if not topics:
             return {}
-        self._writer.add_topic(MOVING_TRANSFORMS, TRANSFORM_TYPE, recording.topics[MOVING_TRANSFORMS].qos or ())
-        return {MOVING_TRANSFORMS: self._copy}
+        self._writer.add_topic(MOVING_TRANSFORMS, TRANSFORM_TYPE, recording.topics[topics[0]].qos or ())
+        return dict.fromkeys(topics, self._copy)
 
     def _copy(self, message: RecordedMessage) -> None:
-        self._writer.write(message.topic, message.log_time, message.cdr)
+        self._writer.write(MOVING_TRANSFORMS, message.log_time, message.cdr)
 
     def _static_transforms(self, log_time: int) -> Any:
         """Join all fixed transforms to one message: of a latched topic, players and viewers keep the last alone."""

@@ -13,6 +13,7 @@ from cvcdepth_core.errors import TransformError
 from cvcdepth_core.rig.poses import Pose, inverse, quaternion_from_rotation
 from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_ros.bags import RecordedMessage, Recording
+from cvcdepth_ros.messages.transform_topics import moving_transform_topics
 from cvcdepth_ros.messages.transforms import TransformTree, frame_name, links_of
 
 MOVING_TRANSFORMS = "/tf"
@@ -115,10 +116,11 @@ def _chain(tree: TransformTree, links: Mapping[str, ObservedLink], frame: str, f
 
 
 def _spread_messages(recording: Recording) -> Iterator[RecordedMessage]:
+    topics = moving_transform_topics(recording)
     duration = recording.end + 1 - recording.start
     if duration <= _SECONDS_EXAMINED * NANOSECONDS:
-        yield from recording.messages([MOVING_TRANSFORMS])
+        yield from recording.messages(topics)
         return
     for number in range(_SECONDS_EXAMINED):
         start = recording.start + (duration - NANOSECONDS) * number // (_SECONDS_EXAMINED - 1)
-        yield from recording.messages([MOVING_TRANSFORMS], start, start + NANOSECONDS)
+        yield from recording.messages(topics, start, start + NANOSECONDS)

@@ -12,8 +12,8 @@ from cvcdepth_core.errors import RecordingError, TransformError
 from cvcdepth_core.rig.poses import Pose, pose_from_quaternion
 from cvcdepth_ros.bags import RecordedMessage, Recording
 from cvcdepth_ros.messages.conversion import stamp_ns
+from cvcdepth_ros.messages.transform_topics import moving_transform_topics
 from cvcdepth_ros.messages.transforms import PoseTrack, TransformTree, frame_name
-from cvcdepth_ros.recordings.fixed_frames import MOVING_TRANSFORMS
 
 ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
 
@@ -37,7 +37,7 @@ def find_motion_link(recording: Recording, base_frame: str, static: TransformTre
     None where there is none in the first thousand messages of any of these topics.
     """
     odometry = sorted(topic.name for topic in recording.topics.values() if topic.type == ODOMETRY_TYPE)
-    for topic in (name for name in (MOVING_TRANSFORMS, *odometry) if name in recording.topics):
+    for topic in (*moving_transform_topics(recording), *odometry):
         for message in islice(recording.messages([topic]), _MESSAGES_TO_FIND_MOTION):
             for parent, child in _moving_links(recording, message):
                 child_T_base = _fixed_pose(static, child, base_frame)

@@ -19,7 +19,9 @@ from cvcdepth_core.estimator import DepthPredictor, SurroundDepthEstimator
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.stamps import NANOSECONDS, exposure_times
 from cvcdepth_ros.bags import RecordedMessage
+from cvcdepth_ros.messages.camera_info import content_of, is_usable
 from cvcdepth_ros.messages.conversion import stamp_ns
+from cvcdepth_ros.messages.recorded_changes import moment_of
 from cvcdepth_ros.recordings.refusals import Refusals
 from cvcdepth_ros.recordings.rig import RecordedRig
 from cvcdepth_ros.recordings.rig_messages import add_camera_info
@@ -57,7 +59,8 @@ class SurroundReplay:
         self.layout = recorded.layout
         self.unreadable = Refusals()
         """Images and CameraInfos that cannot be deserialised."""
-        self._assembler = recorded.assembler()
+        self._assembler, self._recalibrated = recorded.open_assembler()
+        self._last_infos: dict[str, tuple[Any, ...]] = {}
         self._rig: Rig | RigError = self._assembler.rig()
         self._tolerance = matching.tolerance
         self._synchroniser: SurroundSynchronizer[RecordedImage] = SurroundSynchronizer.from_layout(
@@ -80,6 +83,16 @@ class SurroundReplay:
     def frame_ids(self) -> dict[str, str]:
         """Each camera's optical frame."""
         return {name: self._assembler.frame_id(name) or "" for name in self.layout.names}
+
+    @property
+    def calibration_changes(self) -> list[str]:
+        """Which cameras' calibrations changed in what was read so far, when and how."""
+        return [f"{change}, {moment_of(time, self.recording)}" for time, change in self._assembler.changes]
+
+    @property
+    def notes(self) -> list[str]:
+        """What is odd about the recording and its rig, and how it was understood, a line each."""
+        return [*self.recording.notes, *self._assembler.notes, *self.calibration_changes]
 
     @property
     def statistics(self) -> SynchronizerStatistics:
@@ -143,11 +156,22 @@ class SurroundReplay:
         except RecordingError as error:
             self.unreadable.add(str(error))
             return
+        if self._says_nothing_new(message.topic, info):
+            return
         if add_camera_info(self._assembler, message.topic, info):
             try:
                 self._rig = self._assembler.rig()
             except RigError as error:
                 self._rig = error
+
+    def _says_nothing_new(self, topic: str, info: Any) -> bool:
+        """Say whether a CameraInfo is as the last one, or invalid where the recording's own calibration is used."""
+        content = content_of(info)
+        if self._last_infos.get(topic) == content:
+            return True
+        self._last_infos[topic] = content
+        cameras = {camera.name for camera in self.layout.cameras if camera.camera_info_topic == topic}
+        return cameras <= self._recalibrated and not is_usable(info)
 
 
 class DepthReplay:

@@ -12,13 +12,12 @@ from pydantic import ValidationError
 from cvcdepth_core.errors import RecordingError, RigError, first_validation_message
 from cvcdepth_core.rig.rig_file import CameraEntry, RigLayout
 from cvcdepth_ros.bags import Recording
-from cvcdepth_ros.messages.camera_discovery import CAMERA_INFO_TYPE, COMPRESSED_IMAGE_TYPE, IMAGE_TYPE, discover_cameras
+from cvcdepth_ros.messages.camera_discovery import CAMERA_INFO_TYPE, RECORDED_IMAGE_TYPES
+from cvcdepth_ros.messages.recorded_cameras import find_recorded_cameras
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
 from cvcdepth_ros.messages.transforms import TransformTree
 from cvcdepth_ros.recordings.motion import MotionLink, VehicleMotion, find_motion_link
 from cvcdepth_ros.recordings.rig_messages import RigMessages
-
-IMAGE_TYPES = (IMAGE_TYPE, COMPRESSED_IMAGE_TYPE)
 
 
 class RecordedRig:
@@ -67,6 +66,18 @@ class RecordedRig:
         """Return a new assembler with this rig in it, to which later CameraInfos can be added."""
         return self._messages.assembler(self.layout)
 
+    def open_assembler(self) -> tuple[RigAssembler, set[str]]:
+        """Return an assembler that later CameraInfos can change, and the cameras whose calibration they are told to.
+
+        A rig file's calibration that differs from the recording's stays as it is.
+        """
+        told = {camera.name for camera in self.layout.cameras if self._messages.tells_calibration_of(camera)}
+        cameras = tuple(
+            camera.model_copy(update={"calibration": None}) if camera.name in told else camera
+            for camera in self.layout.cameras
+        )
+        return self._messages.assembler(self.layout.model_copy(update={"cameras": cameras})), told
+
     @property
     def static_links(self) -> Mapping[str, Any]:
         """The last `geometry_msgs/TransformStamped` of `/tf_static` for each child frame."""
@@ -78,9 +89,9 @@ class RecordedRig:
         return self._messages.lidars
 
     @property
-    def camera_clouds(self) -> tuple[str, ...]:
-        """The topics with clouds that were made from camera images."""
-        return self._messages.camera_clouds
+    def other_clouds(self) -> Mapping[str, str]:
+        """By topic, why its clouds are no LiDAR's."""
+        return self._messages.other_clouds
 
     def vehicle_motion(self) -> VehicleMotion | None:
         """Return the vehicle's motion, still to be added message by message; None where none is recorded."""
@@ -116,27 +127,19 @@ def discover_layout(recording: Recording, base_frame: str) -> RigLayout:
 
 
 def recorded_cameras(recording: Recording) -> list[CameraEntry]:
-    """Return the cameras of which something was recorded, see `discover_cameras`."""
-    return discover_cameras({topic.name: topic.type for topic in recording.topics.values() if topic.count})
+    """Return the cameras of which something was recorded, see `find_cameras`."""
+    return find_recorded_cameras(recording).cameras
 
 
 def topics_without_images(recording: Recording) -> Iterator[str]:
     """Yield the camera_info topics without images in their namespace: a rig that is found would silently lack them."""
-    seeing = {camera.camera_info_topic for camera in recorded_cameras(recording)}
-    for topic in recording.topics.values():
-        if topic.type == CAMERA_INFO_TYPE and topic.name not in seeing and not is_of_depth(topic.name):
-            yield topic.name
-
-
-def is_of_depth(topic: str) -> bool:
-    """Whether a topic carries depth images, by its name."""
-    return any(part.lower().startswith(("depth", "compresseddepth")) for part in topic.split("/"))
+    yield from find_recorded_cameras(recording).without_images
 
 
 def topic_problems(recording: Recording, layout: RigLayout) -> Iterator[str]:
     """Yield what is wrong with the topics that the cameras need, camera by camera."""
     for camera in layout.cameras:
-        problem = _topic_problem(recording, camera.image_topic, IMAGE_TYPES)
+        problem = _topic_problem(recording, camera.image_topic, RECORDED_IMAGE_TYPES)
         if problem is None and (camera.calibration is None or camera.frame_id is None):
             problem = _topic_problem(recording, camera.camera_info_topic, (CAMERA_INFO_TYPE,))
         if problem is not None:
@@ -155,8 +158,10 @@ def _topic_problem(recording: Recording, name: str, types: Sequence[str]) -> str
 
 def _too_few(entries: Sequence[CameraEntry], recording: Recording) -> str:
     infos = [topic.name for topic in recording.topics.values() if topic.type == CAMERA_INFO_TYPE]
-    images = [topic.name for topic in recording.topics.values() if topic.type in IMAGE_TYPES]
+    images = [topic.name for topic in recording.topics.values() if topic.type in RECORDED_IMAGE_TYPES]
+    offers = find_recorded_cameras(recording).offers
     return (
         f"a surround rig needs two cameras, found {len(entries)}: a camera is a namespace with a camera_info and an "
         f"image topic; camera_info: {', '.join(infos) or 'none'}; images: {', '.join(images) or 'none'}"
+        f"{offers and f'; {offers}'}"
     )

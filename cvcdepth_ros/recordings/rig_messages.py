@@ -3,24 +3,31 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from contextlib import suppress
 from copy import deepcopy
 from functools import cached_property
 from typing import Any, NamedTuple
 
-from cvcdepth_core.errors import RecordingError, TransformError
-from cvcdepth_core.rig.rig_file import RigLayout
+from cvcdepth_core.errors import RecordingError, RigError, TransformError
+from cvcdepth_core.rig.rig_file import CameraEntry, RigLayout
 from cvcdepth_ros.bags import RecordedMessage, Recording
 from cvcdepth_ros.messages.camera_discovery import CAMERA_INFO_TYPE
-from cvcdepth_ros.messages.point_clouds import POINT_CLOUD_TYPE, has_colours
+from cvcdepth_ros.messages.camera_info import MOST_UNCALIBRATED, is_uncalibrated, read_camera_info
+from cvcdepth_ros.messages.cloud_sources import why_no_lidar
+from cvcdepth_ros.messages.point_clouds import POINT_CLOUD_TYPE
+from cvcdepth_ros.messages.recorded_changes import moment_of
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
+from cvcdepth_ros.messages.transform_topics import (
+    describe_transform_topics,
+    moving_transform_topics,
+    static_transform_topics,
+)
 from cvcdepth_ros.messages.transforms import TransformTree, frame_name
 from cvcdepth_ros.recordings.fixed_frames import (
-    MOVING_TRANSFORMS,
     ObservedLink,
     add_fixed_frames,
-    has_transforms,
     observed_links,
 )
 
@@ -31,8 +38,8 @@ class CloudSource(NamedTuple):
     """The source of one topic's clouds, by its first message that can be read."""
 
     frame_id: str
-    has_colours: bool
-    """Whether they were made from camera images: a LiDAR's points have no colours."""
+    why_no_lidar: str | None
+    """None where it may be a LiDAR."""
 
 
 class RigMessages:
@@ -50,28 +57,37 @@ class RigMessages:
         self._recording = recording
         self.static_links: dict[str, Any] = {}
         """The last `geometry_msgs/TransformStamped` of `/tf_static` for each child frame."""
-        self._camera_infos: dict[str, Any] = {}
-        """By topic; RecordingError in place of a message that cannot be read."""
+        self._camera_infos: dict[str, list[Any]] = defaultdict(list)
+        """By topic, up to the first with a calibration; RecordingError in place of a message that cannot be read."""
         self._clouds: dict[str, CloudSource] = {}
         self._transforms = TransformTree()
         self._contradiction: TransformError | RecordingError | None = None
         self._awaited = {*_camera_info_topics(recording, layout), *cloud_topics(recording)}
-        if has_transforms(recording, STATIC_TRANSFORMS):
-            self._awaited.add(STATIC_TRANSFORMS)
+        self._static_topics = static_transform_topics(recording)
+        self._awaited.update(self._static_topics)
         self._read()
 
     @property
     def lidars(self) -> tuple[str, ...]:
-        """The topics of the LiDARs, sorted: those of all point clouds that were not made from camera images."""
-        return tuple(topic for topic in cloud_topics(self._recording) if topic not in self.camera_clouds)
+        """The topics of the LiDARs, sorted: those of all point clouds but the other ones."""
+        return tuple(topic for topic in cloud_topics(self._recording) if topic not in self.other_clouds)
 
     @property
-    def camera_clouds(self) -> tuple[str, ...]:
-        """The topics with clouds that were made from camera images, sorted.
+    def other_clouds(self) -> dict[str, str]:
+        """By topic, why its clouds are no LiDAR's, see `why_no_lidar`.
 
         The node's own clouds are among them where it ran during the recording: they are no ground truth.
         """
-        return tuple(sorted(topic for topic, source in self._clouds.items() if source.has_colours))
+        return {topic: source.why_no_lidar for topic, source in sorted(self._clouds.items()) if source.why_no_lidar}
+
+    def tells_calibration_of(self, camera: CameraEntry) -> bool:
+        """Whether the camera's calibration in a layout is the one that the recording tells."""
+        infos = [info for info in self._camera_infos[camera.camera_info_topic] if not isinstance(info, RecordingError)]
+        if camera.calibration is None or not infos:
+            return False
+        with suppress(RigError):
+            return read_camera_info(infos[-1], camera.name).calibration == camera.calibration
+        return False
 
     def assembler(self, layout: RigLayout) -> RigAssembler:
         """Return an assembler of `layout` with everything that was read for it; the rig may still be incomplete.
@@ -81,13 +97,16 @@ class RigMessages:
         for transforms that contradict each other, and for a camera that moves.
         """
         assembler = RigAssembler(layout, deepcopy(self._transforms))
-        for topic, info in self._camera_infos.items():
-            if isinstance(info, RecordingError):
-                raise info
-            add_camera_info(assembler, topic, info)
+        assembler.about_transforms = describe_transform_topics(self._recording)
+        for topic, infos in self._camera_infos.items():
+            readable = [info for info in infos if not isinstance(info, RecordingError)]
+            if infos and not readable:
+                raise infos[0]
+            for info in readable:
+                add_camera_info(assembler, topic, info)
         if self._contradiction is not None:
             raise self._contradiction
-        if has_transforms(self._recording, MOVING_TRANSFORMS):
+        if moving_transform_topics(self._recording):
             self._add_fixed_frames(assembler)
         return assembler
 
@@ -109,37 +128,41 @@ class RigMessages:
         return None
 
     def _take(self, message: RecordedMessage) -> None:
-        if message.topic == STATIC_TRANSFORMS:
+        if message.topic in self._static_topics:
             self._add_transforms(message)
         elif self._recording.topics[message.topic].type == CAMERA_INFO_TYPE:
-            self._awaited.remove(message.topic)
-            self._camera_infos[message.topic] = self._content_or_error(message)
+            self._add_camera_info(message)
         else:
             self._add_cloud(message)
 
     def _add_transforms(self, message: RecordedMessage) -> None:
         try:
             content = self._recording.deserialize(message)
-            self._transforms.add_message(content)
+            self._transforms.add_message(content, moment_of(message.log_time, self._recording))
             self.static_links |= {frame_name(link.child_frame_id): link for link in content.transforms}
         except TransformError as error:
-            self._contradiction = TransformError(f"{self._recording.path}: {STATIC_TRANSFORMS}: {error}")
+            self._contradiction = TransformError(f"{self._recording.path}: {message.topic}: {error}")
         except RecordingError as error:
             self._contradiction = error
         if self._contradiction is not None:
-            self._awaited.remove(STATIC_TRANSFORMS)
+            self._awaited.difference_update(self._static_topics)
 
     def _add_cloud(self, message: RecordedMessage) -> None:
         with suppress(RecordingError):
             content = self._recording.deserialize(message)
-            self._clouds[message.topic] = CloudSource(content.header.frame_id, has_colours(content))
+            self._clouds[message.topic] = CloudSource(content.header.frame_id, why_no_lidar(message.topic, content))
             self._awaited.remove(message.topic)
 
-    def _content_or_error(self, message: RecordedMessage) -> Any:
+    def _add_camera_info(self, message: RecordedMessage) -> None:
+        """Take one that may be without a calibration: drivers send zeros until they have read their file."""
+        infos = self._camera_infos[message.topic]
         try:
-            return self._recording.deserialize(message)
+            infos.append(self._recording.deserialize(message))
         except RecordingError as error:
-            return error
+            infos.append(error)
+        has_calibration = not isinstance(infos[-1], RecordingError) and not is_uncalibrated(infos[-1])
+        if has_calibration or len(infos) == MOST_UNCALIBRATED:
+            self._awaited.remove(message.topic)
 
     def _add_fixed_frames(self, assembler: RigAssembler) -> None:
         tree, base_frame = assembler.transforms, assembler.layout.base_frame
@@ -162,11 +185,6 @@ class RigMessages:
 def cloud_topics(recording: Recording) -> list[str]:
     """Return the names of all topics with point clouds, sorted."""
     return sorted(topic.name for topic in recording.topics.values() if topic.type == POINT_CLOUD_TYPE and topic.count)
-
-
-def describe_camera_clouds(topics: Sequence[str]) -> str:
-    """Return why these topics, `RigMessages.camera_clouds`, are no LiDAR's."""
-    return f"not taken for a LiDAR's, since their points have colours: {', '.join(topics)}"
 
 
 def add_camera_info(assembler: RigAssembler, topic: str, message: Any) -> bool:

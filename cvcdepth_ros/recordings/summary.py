@@ -13,8 +13,8 @@ from cvcdepth_core.rig.rig_file import CameraEntry
 from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_ros.bags import RecordedMessage, Recording
 from cvcdepth_ros.bags.topics import RecordingFile
-from cvcdepth_ros.messages.conversion import calibration_from_message
-from cvcdepth_ros.recordings.rig import recorded_cameras
+from cvcdepth_ros.messages.camera_info import read_camera_info
+from cvcdepth_ros.messages.recorded_cameras import find_recorded_cameras, first_camera_info
 from cvcdepth_ros.recordings.topic_timing import Timing, TopicTiming
 
 IndexState = Literal["intact", "rebuilt", "damaged"]
@@ -54,6 +54,8 @@ class CameraSummary:
     calibration: Calibration | None
     problem: str | None
     """Why its calibration cannot be used."""
+    notes: tuple[str, ...] = ()
+    """What its CameraInfo does not say as it should, and how it is understood."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,8 @@ class RecordingSummary:
     cameras: tuple[CameraSummary, ...]
     damage: str | None
     """What could not be read, of all files."""
+    notes: tuple[str, ...] = ()
+    """What is odd, and how it is understood, and how cameras were chosen."""
 
     @property
     def index(self) -> IndexState:
@@ -86,7 +90,8 @@ def summarize(
 ) -> RecordingSummary:
     """Read the messages with start <= log_time < stop (ns), so that damage shows, and describe the recording."""
     timings, first = _read(recording, start, stop, progress)
-    cameras = tuple(_camera(recording, entry, first) for entry in recorded_cameras(recording))
+    found = find_recorded_cameras(recording, first)
+    cameras = tuple(_camera(recording, entry, first) for entry in found.cameras)
     return RecordingSummary(
         path=str(recording.path),
         start=recording.start,
@@ -97,6 +102,7 @@ def summarize(
         ),
         cameras=cameras,
         damage=recording.damage,
+        notes=(*recording.notes, *found.choices, *found.left_out, *([found.offers] if found.offers else [])),
     )
 
 
@@ -122,17 +128,18 @@ def _file(file: RecordingFile) -> FileSummary:
 
 def _camera(recording: Recording, entry: CameraEntry, first: Mapping[str, RecordedMessage]) -> CameraSummary:
     calibration, frame_id, problem = None, None, None
+    notes: tuple[str, ...] = ()
     try:
-        info = _first(recording, entry.camera_info_topic, first)
+        info = first_camera_info(recording, entry.camera_info_topic, first.get(entry.camera_info_topic))
         if info is None:
             problem = f"no message on {entry.camera_info_topic}"
         else:
             frame_id = info.header.frame_id
-            calibration = calibration_from_message(info, entry.name)
+            calibration, notes = read_camera_info(info, entry.name)
     except (RecordingError, RigError) as error:
         problem = str(error)
     encoding = _encoding(recording, entry.image_topic, first)
-    return CameraSummary(entry.name, entry.image_topic, encoding, frame_id, calibration, problem)
+    return CameraSummary(entry.name, entry.image_topic, encoding, frame_id, calibration, problem, notes)
 
 
 def _encoding(recording: Recording, topic: str, first: Mapping[str, RecordedMessage]) -> str | None:

@@ -17,7 +17,7 @@ from cvcdepth_ros.bags import RecordedMessage
 from cvcdepth_ros.recordings.fixed_frames import TRANSFORM_TYPE
 
 _GAP = 2.0  # times the median interval
-_HEADER = "std_msgs/msg/Header"
+_HEADER, _TIME = "std_msgs/msg/Header", "builtin_interfaces/msg/Time"
 # A CDR message begins with four bytes, the second of which is the byte order; then comes the first field.
 _LITTLE_ENDIAN, _BIG_ENDIAN = struct.Struct("<iI"), struct.Struct(">iI")
 _FIRST_FIELD = 4
@@ -28,7 +28,9 @@ class StampReader:
 
     def __init__(self, type_: str, store: Typestore) -> None:
         _, fields = store.fielddefs.get(type_, ([], []))
-        is_stamped = bool(fields) and fields[0][1][1] == _HEADER
+        # foxglove's messages begin with the stamp itself, as a header does.
+        begins_with_stamp = bool(fields) and (fields[0][0], fields[0][1][1]) == ("timestamp", _TIME)
+        is_stamped = begins_with_stamp or (bool(fields) and fields[0][1][1] == _HEADER)
         # A TFMessage begins with its number of transforms; the first one's header follows.
         self._offset = _FIRST_FIELD if is_stamped else 2 * _FIRST_FIELD if type_ == TRANSFORM_TYPE else None
 

@@ -42,8 +42,8 @@ class RecordedTruth:
         self._recording = recorded.recording
         self.topics = recorded.lidars if lidar is None else tuple(map(self._checked, lidar))
         """The LiDARs' topics."""
-        self.left_out = recorded.camera_clouds if lidar is None else ()
-        """Topics with clouds that come from cameras."""
+        self.left_out = recorded.other_clouds if lidar is None else {}
+        """By topic, why other clouds are no LiDAR's."""
         self.motion = recorded.vehicle_motion()
         self.refused = Refusals()
         """Sweeps, poses and moments that cannot be used, and why."""

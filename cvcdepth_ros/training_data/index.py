@@ -110,6 +110,8 @@ def index_recording(recorded: RecordedRig, matching: MatchingSettings, needs_ove
     truth = RecordedTruth(recorded, lidar=())
     motion = truth.motion
     sets, thumbnails = _collect(replay, truth)
+    for change in replay.calibration_changes[:1]:
+        raise RigError(f"{path}: {change}; take the parts before and after as two recordings")
     if not sets:
         raise RecordingError(f"{path}: no surround set: {replay.why_no_set()}")
     poses = None if motion is None else [_poses(motion, surround_set) for surround_set in sets]

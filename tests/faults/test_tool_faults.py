@@ -391,10 +391,10 @@ FAULTS = {
     "ROS 1 chunk in lz4, announced as 1 kB": Fault(
         _inspected(_ros1_bomb("lz4", 1000)), 0, "does not hold the 1000 bytes"
     ),
-    "ROS 1 header of 1 GiB": Fault(_inspected(_large_ros1_header), 1, "record of 1153433600 bytes at byte 17"),
+    "ROS 1 header of 1 GiB": Fault(_inspected(_large_ros1_header), 1, "header of 1153433600 bytes at byte 13"),
     "ROS 1 index that repeats itself": Fault(_inspected(_repeated_ros1_index), 1, "they overlap"),
     "ROS 1 message of 300 million nothings": Fault(
-        _inspected(_ros1_nothings(f"y/B[] a\n{'=' * 80}\nMSG: y/B\n")), 1, "elements without bytes"
+        _inspected(_ros1_nothings(f"y/B[] a\n{'=' * 80}\nMSG: y/B\n")), 0, "elements without bytes"
     ),
     "three million records in a chunk": Fault(_inspected(_million_records), 1, "more than 1048576 records"),
     "25 definitions of 60 MiB": Fault(_inspected(_definitions(25, 60 * MIB)), 1, "topics and types of more than 67"),

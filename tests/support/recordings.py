@@ -89,18 +89,22 @@ def write_rosbag2(
     return path
 
 
-def write_mcap(path: Path, entries: Iterable[Entry], **options: Any) -> Path:
-    """Write a lone .mcap with the mcap library (`options` are its Writer's); it has checksums, rosbags' has not."""
+def write_mcap(path: Path, entries: Iterable[Entry], by_type: bool = False, **options: Any) -> Path:
+    """Write a lone .mcap with the mcap library (`options` are its Writer's); it has checksums, rosbags' has not.
+
+    `by_type` gives each type of a topic a channel of its own.
+    """
     with path.open("wb") as stream:
         writer = mcap.writer.Writer(stream, **{"chunk_size": 256 * 1024, **options})
         writer.start(profile="ros2", library="tests")
-        channels: dict[str, int] = {}
+        channels: dict[tuple[str, str], int] = {}
         for entry in entries:
-            if entry.topic not in channels:
+            key = entry.topic, entry.type * by_type
+            if key not in channels:
                 definition = JAZZY.generate_msgdef(entry.type, ros_version=2)[0].encode()
                 schema = writer.register_schema(entry.type, "ros2msg", definition)
-                channels[entry.topic] = writer.register_channel(entry.topic, "cdr", schema)
-            writer.add_message(channels[entry.topic], entry.log_time, entry.cdr, entry.log_time)
+                channels[key] = writer.register_channel(entry.topic, "cdr", schema)
+            writer.add_message(channels[key], entry.log_time, entry.cdr, entry.log_time)
         writer.finish()
     return path
 
@@ -205,6 +209,29 @@ def ros1_copy(path: Path, sets: int = 10, compression: Ros1Writer.CompressionFor
                 )
             raw = JAZZY.cdr_to_ros1(entry.cdr, entry.type)
             writer.write(connections[entry.topic], entry.log_time, raw)
+    return path
+
+
+def sqlite_with_types(path: Path, entries: Iterable[Entry]) -> Path:
+    """A .db3 in which each type of a topic has a row of its own, as rosbag2 writes it."""
+    named = [entry._replace(topic=f"{entry.topic}@{entry.type}") for entry in entries]
+    database_path = write_rosbag2(path, named, StoragePlugin.SQLITE3) / f"{path.name}.db3"
+    with closing(sqlite3.connect(database_path)) as database:
+        database.execute("UPDATE topics SET name = substr(name, 1, instr(name, '@') - 1)")
+        database.commit()
+    return path
+
+
+def ros1_with_types(path: Path, entries: Iterable[Entry]) -> Path:
+    """A ROS 1 bag in which each type of a topic has a connection of its own."""
+    noetic = get_typestore(Stores.ROS1_NOETIC)
+    noetic.register({"tf2_msgs/msg/TFMessage": JAZZY.fielddefs["tf2_msgs/msg/TFMessage"]})
+    with Ros1Writer(path) as writer:
+        connections: dict[str, Any] = {}
+        for entry in entries:
+            if entry.type not in connections:
+                connections[entry.type] = writer.add_connection(entry.topic, entry.type, typestore=noetic)
+            writer.write(connections[entry.type], entry.log_time, JAZZY.cdr_to_ros1(entry.cdr, entry.type))
     return path
 
 

@@ -254,6 +254,21 @@ def test_a_message_beyond_measure_in_a_database_costs_only_itself(
         assert f"{sample[2].topic} at {sample[2].log_time} ns skipped: 1000001 bytes" in (recording.damage or "")
 
 
+def test_a_definition_in_another_character_set_is_read_from_a_database(tmp_path: Path):
+    path = recordings.sqlite_copy(tmp_path / "bag", sets=1)
+    with closing(sqlite3.connect(path / "bag.db3")) as database:
+        text = b"float32 a # in \xb0C".hex()
+        database.execute(
+            "INSERT INTO message_definitions(topic_type, encoding, encoded_message_definition, type_description_hash) "
+            f"VALUES ('my_msgs/msg/Angle', 'ros2msg', CAST(x'{text}' AS TEXT), '')"
+        )
+        database.execute("UPDATE topics SET type = 'my_msgs/msg/Angle' WHERE name = '/odom'")
+        database.commit()
+    with open_recording(path) as recording:
+        assert recording.topics["/odom"].definition == "float32 a # in \ufffdC"
+        assert recording.damage is None
+
+
 @pytest.mark.skipif(sys.version_info < (3, 11), reason="sqlite3 has no limits")
 def test_a_name_beyond_measure_in_a_database_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(sqlite_file, "MAX_BLOCK_BYTES", 100_000)
@@ -360,7 +375,7 @@ NO_RECORDINGS = {
     ),
     "cut ROS 1 bag": (
         lambda path: recordings.cut(recordings.ros1_copy(path / "whole.bag", sets=1), path / "a.bag"),
-        "a.bag: .*rosbag reindex",
+        "holds no readable message .*a.bag: cut or unreadable from byte",
     ),
 }
 
@@ -450,12 +465,34 @@ def test_a_type_that_nobody_defines_is_named(sample: list[Entry], tmp_path: Path
         recording.deserialize(next(recording.messages()))
 
 
-def test_two_types_on_one_topic_are_refused(sample: list[Entry], tmp_path: Path):
-    odometry = next(entry for entry in sample if entry.topic == "/odom")
-    first = recordings.write_rosbag2(tmp_path / "first", [odometry])
-    second = recordings.write_rosbag2(tmp_path / "second", [sample[0]._replace(topic="/odom")])
-    with pytest.raises(RecordingError, match="/odom has two types, nav_msgs/msg/Odometry and tf2_msgs/msg/TFMessage"):
-        open_recording([first, second])
+def two_types(path: Path, sample: list[Entry]) -> tuple[list[Entry], list[Entry]]:
+    """Two odometry messages and one of transforms, all under one name."""
+    odometry = [entry for entry in sample if entry.topic == "/odom"][:2]
+    return odometry, [sample[0]._replace(topic="/odom")]
+
+
+TWO_TYPES = {
+    "files": lambda path, one, other: [
+        recordings.write_rosbag2(path / "first", other),
+        recordings.write_rosbag2(path / "second", one),
+    ],
+    "mcap": lambda path, one, other: recordings.write_mcap(path / "a.mcap", [*other, *one], by_type=True),
+    "sqlite": lambda path, one, other: recordings.sqlite_with_types(path / "a", [*other, *one]),
+    "ros1": lambda path, one, other: recordings.ros1_with_types(path / "a.bag", [*other, *one]),
+}
+
+
+@pytest.mark.parametrize("storage", TWO_TYPES)
+def test_two_types_under_one_name_are_two_topics(storage: str, sample: list[Entry], tmp_path: Path):
+    one, other = two_types(tmp_path, sample)
+    with open_recording(TWO_TYPES[storage](tmp_path, one, other)) as recording:
+        assert {name: (topic.type, topic.count) for name, topic in recording.topics.items()} == {
+            "/odom": ("nav_msgs/msg/Odometry", 2),
+            "/odom (tf2_msgs/msg/TFMessage)": ("tf2_msgs/msg/TFMessage", 1),
+        }
+        assert [hasattr(recording.deserialize(m), "pose") for m in recording.messages(["/odom"])] == [True, True]
+        (message,) = recording.messages(["/odom (tf2_msgs/msg/TFMessage)"])
+        assert recording.deserialize(message).transforms
 
 
 # Writing

@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Blocks that were read last are kept, up to a number of bytes."""
 
-from mcap.records import McapRecord, Message
-
-from cvcdepth_ros.bags.recent_blocks import MESSAGE_BYTES, RecentBlocks
+from cvcdepth_ros.bags.recent_blocks import MESSAGE_BYTES, RecentBlocks, StoredMessage
 
 
-def block(size: int, messages: int = 1) -> list[McapRecord]:
-    return [Message(0, number, b"x" * (size // messages - MESSAGE_BYTES), number, 0) for number in range(messages)]
+def block(size: int, messages: int = 1) -> list[StoredMessage]:
+    return [StoredMessage(0, number, b"x" * (size // messages - MESSAGE_BYTES)) for number in range(messages)]
 
 
 def test_what_was_not_used_for_longest_makes_room():

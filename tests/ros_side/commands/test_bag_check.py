@@ -322,13 +322,13 @@ def test_a_cloud_that_is_no_truth_is_a_warning_beside_a_lidar_that_is(check, sam
     assert check(SAMPLE, "--no-lidar")["LiDAR"]["status"] == "skipped"
 
 
-def test_a_map_that_came_once_before_the_part_is_a_warning_beside_a_lidar_that_is(check, sample, tmp_path: Path):
+def test_a_cloud_that_came_once_before_the_part_is_a_warning_beside_a_lidar_that_is(check, sample, tmp_path: Path):
     first = next(entry for entry in sample if entry.topic == "/lidar/points")
-    entries = sorted([*sample, first._replace(topic="/map")], key=lambda entry: entry.log_time)
+    entries = sorted([*sample, first._replace(topic="/once")], key=lambda entry: entry.log_time)
     found = check(recordings.write_rosbag2(tmp_path / "bag", entries), "--start", "0.3")["LiDAR"]
     assert found["status"] == "warning"
     assert list(found["values"]) == ["/lidar/points"]
-    assert "no sweep on /map in this part" in found["finding"]
+    assert "no sweep on /once in this part" in found["finding"]
 
 
 def test_points_that_are_too_far_away_to_be_true_fail(check, sample):
@@ -372,7 +372,7 @@ def test_an_image_that_cannot_be_decoded_fails(check, sample):
 
 def test_an_unknown_encoding_fails(check, sample):
     def rename(message: Any) -> None:
-        message.encoding = "yuv422"
+        message.encoding = "yuv444"
 
     raw = recordings.with_raw_images(recordings.sample_entries(2), "bgr8")
     found = check(recordings.changed(raw, "/camera/left/image_raw", rename))["encodings"]
