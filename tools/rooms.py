@@ -62,7 +62,7 @@ ROS_ROOMS = {
     "live": "installation messages surround_sets",
     "checks": "settings bags messages surround_sets recordings",
     "training_data": "settings recently_used bags kept messages surround_sets recordings",
-    "evaluation": "installation settings console bags kept surround_sets recordings",
+    "evaluation": "installation settings console bags kept messages surround_sets recordings",
     "node": "settings bags messages surround_sets live",
     "finetuning": "installation settings console bags kept surround_sets recordings checks training_data evaluation",
     "end_to_end": "installation console bags messages surround_sets live node",

@@ -94,8 +94,10 @@ class CheckContext:
         """Why the recorded transforms make no tree."""
         self.refusal: str | None = None
         """Why the cameras make no rig at all."""
+        messages = RigMessages(recording, rig_layout)
+        self.first_messages = messages.firsts
+        """Of each topic that may be a camera's; of CameraInfos where there is a rig file."""
         layout = self._chosen_layout(rig_layout)
-        messages = RigMessages(recording, layout)
         self.assembler = None if layout is None else self._assembled(messages, layout)
         """None where the cameras make no rig, or the transforms contradict each other."""
         self.lidars = messages.lidars if options.lidar is None else options.lidar

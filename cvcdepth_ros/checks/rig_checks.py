@@ -69,7 +69,9 @@ def check_camera_infos(context: CheckContext) -> CheckResult:
     distinct = ", ".join(dict.fromkeys(sizes.values()))
     remedy = "calibrate the camera at the size that is recorded, or correct camera_info or the rig file"
     found = f"{len(sizes)} valid, of the images' size ({distinct})"
-    changes = [] if problems or context.has_rig_file else find_calibration_changes(context.recording, assembler.layout)
+    changes = []
+    if not problems and not context.has_rig_file:
+        changes = find_calibration_changes(context.recording, assembler.layout, context.first_messages)
     if changes:
         remedy = "take the parts before and after as two recordings"
         return CheckResult("warning", f"{found}; {'; '.join(changes[:_MAX_LISTED])}", remedy, {"changes": changes})

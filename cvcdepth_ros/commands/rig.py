@@ -46,7 +46,6 @@ def execute(arguments: argparse.Namespace) -> None:
     """Write the rig file and show what is in it."""
     from cvcdepth_core.rig.rig_file import save_rig_layout
     from cvcdepth_ros.bags import open_recording
-    from cvcdepth_ros.messages.rig_notes import rig_notes
     from cvcdepth_ros.recordings.rig import RecordedRig
 
     if not arguments.force:
@@ -55,7 +54,7 @@ def execute(arguments: argparse.Namespace) -> None:
         recorded = RecordedRig.from_recording(recording, base_frame=arguments.base_frame)
         layout = recorded.layout.model_copy(update={"anchor": _anchor(recorded.layout, arguments.anchor)})
         path, shares = recording.path, dict[str, float]()
-        for note in rig_notes(recording, layout):
+        for note in recorded.notes():
             warn(f"{path}: {note}")
         if arguments.masks:
             folder = arguments.output.parent / f"{arguments.output.stem}_masks"

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cameras whose calibration is not the same over a whole recording: which, when, and what changed."""
 
+from collections.abc import Mapping
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -9,7 +10,7 @@ import numpy as np
 from cvcdepth_core.errors import RecordingError, RigError
 from cvcdepth_core.rig.calibration import Calibration
 from cvcdepth_core.rig.rig_file import RigLayout
-from cvcdepth_ros.bags import Recording
+from cvcdepth_ros.bags import RecordedMessage, Recording
 from cvcdepth_ros.messages.calibration_changes import describe_change
 from cvcdepth_ros.messages.camera_info import is_uncalibrated, read_camera_info
 
@@ -30,14 +31,19 @@ def moment_of(time: int, recording: Recording) -> str:
     return f"at {time / _NANOSECONDS:.3f} s of its clock"
 
 
-def find_calibration_changes(recording: Recording, layout: RigLayout) -> list[str]:
-    """Say which cameras' CameraInfos change during the recording, when, and how; a line for each change.
+def find_calibration_changes(
+    recording: Recording, layout: RigLayout, firsts: Mapping[str, RecordedMessage]
+) -> list[str]:
+    """Return which cameras' CameraInfos change during the recording, when, and how; a line for each change.
 
-    Looked at are a few moments, spread over the recording, and where two differ those in between.
+    Looked at are a few moments, spread over the recording, and where two differ those in between. `firsts` are the
+    topics' first messages.
     """
     topics = {camera.name: camera.camera_info_topic for camera in layout.cameras}
     infos = {topic for topic in topics.values() if topic in recording.topics}
-    rounds = [_samples(recording, infos, *span) for span in _spans(recording)]
+    known = ((topic, firsts[topic]) for topic in infos if topic in firsts)
+    first = {topic: _Sample(m.log_time, found) for topic, m in known if (found := _calibration(recording, m))}
+    rounds = [first, *(_samples(recording, infos, *span) for span in _spans(recording)[1:])]
     changes = []
     for camera, topic in topics.items():
         samples = [found[topic] for found in rounds if topic in found]

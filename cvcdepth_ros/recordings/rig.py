@@ -14,6 +14,7 @@ from cvcdepth_core.rig.rig_file import CameraEntry, RigLayout
 from cvcdepth_ros.bags import Recording
 from cvcdepth_ros.messages.camera_discovery import CAMERA_INFO_TYPE, RECORDED_IMAGE_TYPES
 from cvcdepth_ros.messages.recorded_cameras import find_recorded_cameras
+from cvcdepth_ros.messages.recorded_changes import find_calibration_changes
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
 from cvcdepth_ros.messages.transforms import TransformTree
 from cvcdepth_ros.recordings.motion import MotionLink, VehicleMotion, find_motion_link
@@ -48,10 +49,11 @@ class RecordedRig:
         than two cameras are found; RigError or TransformError, naming the recording and the camera, for the first that
         is not calibrated or has no transform to the base frame, which `base_frame` names where there is no layout.
         """
+        messages = RigMessages(recording, layout)
         chosen = chosen_layout(recording, layout, base_frame)
         for problem in topic_problems(recording, chosen):
             raise RecordingError(f"{recording.path}: {problem}")
-        found = cls(recording, chosen, RigMessages(recording, chosen))
+        found = cls(recording, chosen, messages)
         return found.completed() if layout is None else found
 
     def completed(self) -> RecordedRig:
@@ -77,6 +79,21 @@ class RecordedRig:
             for camera in self.layout.cameras
         )
         return self._messages.assembler(self.layout.model_copy(update={"cameras": cameras})), told
+
+    def notes(self) -> list[str]:
+        """Return how cameras were chosen, messages understood, and what changes on the way, a line each.
+
+        The rig is of the beginning of the recording.
+        """
+        found = find_recorded_cameras(self.recording)
+        changes = find_calibration_changes(self.recording, self.layout, self._messages.firsts)
+        return [
+            *self.recording.notes,
+            *found.choices,
+            *found.left_out,
+            *self.open_assembler()[0].notes,
+            *(f"{change}; the rig is that of what comes before" for change in changes),
+        ]
 
     @property
     def static_links(self) -> Mapping[str, Any]:

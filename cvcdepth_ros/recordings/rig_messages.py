@@ -13,10 +13,11 @@ from typing import Any, NamedTuple
 from cvcdepth_core.errors import RecordingError, RigError, TransformError
 from cvcdepth_core.rig.rig_file import CameraEntry, RigLayout
 from cvcdepth_ros.bags import RecordedMessage, Recording
-from cvcdepth_ros.messages.camera_discovery import CAMERA_INFO_TYPE
+from cvcdepth_ros.messages.camera_discovery import CAMERA_INFO_TYPE, RECORDED_IMAGE_TYPES
 from cvcdepth_ros.messages.camera_info import MOST_UNCALIBRATED, is_uncalibrated, read_camera_info
 from cvcdepth_ros.messages.cloud_sources import why_no_lidar
 from cvcdepth_ros.messages.point_clouds import POINT_CLOUD_TYPE
+from cvcdepth_ros.messages.recorded_cameras import find_recorded_cameras
 from cvcdepth_ros.messages.recorded_changes import moment_of
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
 from cvcdepth_ros.messages.transform_topics import (
@@ -50,22 +51,26 @@ class RigMessages:
     """
 
     def __init__(self, recording: Recording, layout: RigLayout | None) -> None:
-        """Read for the cameras of `layout`; for none of them where it is None.
+        """Read for the cameras of `layout`; where it is None for all that may be found, see `find_recorded_cameras`.
 
         Damaged messages raise nothing here, see `assembler`.
         """
         self._recording = recording
         self.static_links: dict[str, Any] = {}
         """The last `geometry_msgs/TransformStamped` of `/tf_static` for each child frame."""
+        self.firsts: dict[str, RecordedMessage] = {}
+        """The first message of each topic that may be a camera's, by topic."""
         self._camera_infos: dict[str, list[Any]] = defaultdict(list)
         """By topic, up to the first with a calibration; RecordingError in place of a message that cannot be read."""
         self._clouds: dict[str, CloudSource] = {}
         self._transforms = TransformTree()
         self._contradiction: TransformError | RecordingError | None = None
-        self._awaited = {*_camera_info_topics(recording, layout), *cloud_topics(recording)}
+        self._awaited = {*_camera_topics(recording, layout), *cloud_topics(recording)}
         self._static_topics = static_transform_topics(recording)
         self._awaited.update(self._static_topics)
         self._read()
+        if layout is None:
+            find_recorded_cameras(recording, self.firsts)  # which remembers them
 
     @property
     def lidars(self) -> tuple[str, ...]:
@@ -131,7 +136,11 @@ class RigMessages:
         if message.topic in self._static_topics:
             self._add_transforms(message)
         elif self._recording.topics[message.topic].type == CAMERA_INFO_TYPE:
+            self.firsts.setdefault(message.topic, message)
             self._add_camera_info(message)
+        elif self._recording.topics[message.topic].type in RECORDED_IMAGE_TYPES:
+            self.firsts[message.topic] = message
+            self._awaited.remove(message.topic)
         else:
             self._add_cloud(message)
 
@@ -193,9 +202,13 @@ def add_camera_info(assembler: RigAssembler, topic: str, message: Any) -> bool:
     return True in [assembler.add_camera_info(camera, message) for camera in cameras]
 
 
-def _camera_info_topics(recording: Recording, layout: RigLayout | None) -> set[str]:
-    recorded = {topic.name for topic in recording.topics.values() if topic.type == CAMERA_INFO_TYPE}
-    return {camera.camera_info_topic for camera in (layout.cameras if layout else ())} & recorded
+def _camera_topics(recording: Recording, layout: RigLayout | None) -> set[str]:
+    """Return the CameraInfos of a layout's cameras; without one all of them, and all images, to find cameras by."""
+    types = {topic.name: topic.type for topic in recording.topics.values() if topic.count}
+    infos = {name for name, type_ in types.items() if type_ == CAMERA_INFO_TYPE}
+    if layout is not None:
+        return {camera.camera_info_topic for camera in layout.cameras} & infos
+    return infos | {name for name, type_ in types.items() if type_ in RECORDED_IMAGE_TYPES}
 
 
 def _unconnected(tree: TransformTree, base_frame: str, frames: Sequence[str]) -> list[str]:

@@ -21,7 +21,7 @@ from cvcdepth_ros.bags import Recording, open_recording
 from cvcdepth_ros.bags.video import COMPRESSED_VIDEO, FFMPEG_PACKET, VIDEO_DEFINITIONS
 from cvcdepth_ros.messages.conversion import picture_from_message
 from cvcdepth_ros.recordings.replay import SurroundReplay
-from cvcdepth_ros.recordings.rig import discover_rig
+from cvcdepth_ros.recordings.rig import RecordedRig, discover_rig
 from cvcdepth_ros.settings import MatchingSettings
 
 FRAMES = 14
@@ -135,7 +135,7 @@ def test_a_part_that_begins_between_key_frames_is_decoded(recorded: tuple[Path, 
 def test_the_cameras_are_found_and_their_images_matched(recorded: tuple[Path, str]):
     path, _ = recorded
     with open_recording(path) as recording:
-        replay = SurroundReplay(recording, discover_rig(recording), MatchingSettings())
+        replay = SurroundReplay(RecordedRig.from_recording(recording), MatchingSettings())
         sets = list(replay.sets())
         assert len(sets) == FRAMES
         for number, found in enumerate(sets):

@@ -13,12 +13,11 @@ from recordings import Entry
 from small_rig import BEGIN, INFO, TRANSFORMS
 
 from cvcdepth_core.errors import RigError
-from cvcdepth_ros.bags import open_recording
+from cvcdepth_ros.bags import Recording, open_recording
 from cvcdepth_ros.messages.camera_info import read_camera_info
 from cvcdepth_ros.messages.recorded_changes import find_calibration_changes
-from cvcdepth_ros.messages.rig_notes import rig_notes
 from cvcdepth_ros.recordings.replay import SurroundReplay
-from cvcdepth_ros.recordings.rig import discover_layout, discover_rig
+from cvcdepth_ros.recordings.rig import RecordedRig, discover_layout, discover_rig
 from cvcdepth_ros.settings import MatchingSettings
 from cvcdepth_ros.training_data.index import build_index
 
@@ -111,7 +110,7 @@ def test_a_calibration_that_comes_late_is_used_for_all_and_told(camera: str, cou
     path = small_rig.write_drive(tmp_path, small_rig.in_time(early, small_rig.entries()))
     with open_recording(path) as recording:
         layout = discover_rig(recording)
-        replay = SurroundReplay(recording, discover_layout(recording), MatchingSettings())
+        replay = SurroundReplay(RecordedRig.from_recording(recording), MatchingSettings())
         sets = list(replay.sets())
         assert len(sets) == 3
         assert replay.rig.names
@@ -157,13 +156,19 @@ def changing(change: Callable[[Any], None], at: int = CHANGED_AT, until: int = F
     ]
 
 
+def changes_of(recording: Recording) -> list[str]:
+    layout = discover_layout(recording, "base_link")
+    firsts = recording.first_messages([camera.camera_info_topic for camera in layout.cameras])
+    return find_calibration_changes(recording, layout, firsts)
+
+
 @pytest.mark.parametrize(
     ("change", "what"), [(zoomed, "fx 50.0, .*then fx 60.0"), (bent, "then d = "), (shifted, "in P")]
 )
 def test_a_calibration_that_changes_is_told_with_the_moment(change, what: str, tmp_path: Path):
     with open_recording(small_rig.write_drive(tmp_path, changing(change))) as recording:
-        (found,) = find_calibration_changes(recording, discover_layout(recording))
-        notes = rig_notes(recording, discover_rig(recording))
+        (found,) = changes_of(recording)
+        notes = RecordedRig.from_recording(recording).notes()
     assert found.startswith("camera port: its calibration changes")
     assert found.endswith("0.700 s after the beginning")
     assert re.search(what, found)
@@ -172,7 +177,7 @@ def test_a_calibration_that_changes_is_told_with_the_moment(change, what: str, t
 
 def test_a_calibration_that_changes_and_returns_is_told_twice(tmp_path: Path):
     with open_recording(small_rig.write_drive(tmp_path, changing(zoomed, 4, 9))) as recording:
-        found = find_calibration_changes(recording, discover_layout(recording))
+        found = changes_of(recording)
     assert [line.rpartition(", ")[2] for line in found] == [
         "0.400 s after the beginning",
         "0.900 s after the beginning",
@@ -184,12 +189,12 @@ def test_rounding_is_no_change(tmp_path: Path):
         message.k = message.k + np.array([0.01, 0, 0.01, 0, 0.01, 0, 0, 0, 0])
 
     with open_recording(small_rig.write_drive(tmp_path, changing(jitter))) as recording:
-        assert find_calibration_changes(recording, discover_layout(recording)) == []
+        assert changes_of(recording) == []
 
 
 def test_the_replay_takes_each_part_with_its_own_calibration_and_tells(tmp_path: Path):
     with open_recording(small_rig.write_drive(tmp_path, changing(zoomed))) as recording:
-        replay = SurroundReplay(recording, discover_rig(recording), MatchingSettings())
+        replay = SurroundReplay(RecordedRig.from_recording(recording), MatchingSettings())
         focal = [
             next(camera for camera in replay.rig.cameras if camera.name == "port").calibration.k[0]
             for _ in replay.sets()
@@ -260,9 +265,9 @@ def renamed(names: dict[str, str]) -> list[Entry]:
 )
 def test_transforms_in_a_namespace_or_without_slash_are_used(names: dict[str, str], tmp_path: Path):
     with open_recording(small_rig.write_drive(tmp_path, renamed(names))) as recording:
-        layout = discover_rig(recording)
-        told = rig_notes(recording, layout)
-    assert len(layout.cameras) == 3
+        recorded = RecordedRig.from_recording(recording)
+        told = recorded.notes()
+    assert len(recorded.layout.cameras) == 3
     assert any(names["/tf_static"] in note for note in told) == names["/tf_static"].startswith("/")
 
 

@@ -11,7 +11,7 @@ import pytest
 import recordings
 from recordings import SAMPLE, Entry
 
-from cvcdepth_core.errors import RigError
+from cvcdepth_core.errors import RigError, TransformError
 from cvcdepth_core.rig.rig_file import RigLayout
 from cvcdepth_ros.bag_replay import main
 from cvcdepth_ros.bags import open_recording
@@ -95,7 +95,7 @@ def test_nothing_is_read_any_further_of_a_topic_of_which_nothing_more_is_needed(
     with open_recording(SAMPLE) as recording:
         RecordedRig.from_recording(recording)
     counted = {topic: passes.messages.count(topic) for topic in passes.messages}
-    assert len(counted) == 8  # six of camera_info, /tf_static and the LiDAR
+    assert len(counted) == 14  # six of camera_info and of images, /tf_static and the LiDAR
     assert sum(counted.values()) <= len(counted) + 1
 
 
@@ -122,20 +122,26 @@ def test_it_does_not_matter_where_in_the_recording_its_messages_lie(tmp_path: Pa
         np.testing.assert_array_equal(*poses)
 
 
-def test_transforms_of_several_messages_are_joined_and_the_last_of_a_frame_counts(tmp_path: Path):
+def test_transforms_of_several_messages_are_joined_and_a_frame_that_moves_has_no_pose(tmp_path: Path):
     entries = recordings.sample_entries(3)
     (static,) = (entry for entry in entries if entry.topic == "/tf_static")
 
-    def shift(message) -> None:
+    def lidar_alone(message, shift: float = 0.0) -> None:
         message.transforms = [link for link in message.transforms if link.child_frame_id == "pandar64"]
-        message.transforms[0].transform.translation.x += 1.0
+        message.transforms[0].transform.translation.x += shift
 
-    again = next(recordings.changed([static._replace(log_time=entries[-1].log_time)], "/tf_static", shift))
-    first, last = rig_of(entries, tmp_path / "first"), rig_of([*entries, again], tmp_path / "again")
-    moved = last.transforms.lookup("base_link", "pandar64") - first.transforms.lookup("base_link", "pandar64")
-    assert moved[:3, 3].tolist() == pytest.approx([1.0, 0.0, 0.0])
-    assert last.static_links.keys() == first.static_links.keys()
-    assert last.layout == first.layout
+    later = static._replace(log_time=entries[-1].log_time)
+    again = next(recordings.changed([later], "/tf_static", lidar_alone))
+    moved = next(recordings.changed([later], "/tf_static", lambda message: lidar_alone(message, 1.0)))
+    first, joined = rig_of(entries, tmp_path / "first"), rig_of([*entries, again], tmp_path / "again")
+    assert joined.static_links.keys() == first.static_links.keys()
+    assert joined.layout == first.layout
+    poses = [recorded.transforms.lookup("base_link", "pandar64") for recorded in (joined, first)]
+    np.testing.assert_array_equal(*poses)
+    changed = rig_of([*entries, moved], tmp_path / "moved")
+    assert changed.layout == first.layout
+    with pytest.raises(TransformError, match=r"base_link <- pandar64 moves 0\.301 s after the beginning by 1\.000 m"):
+        changed.transforms.lookup("base_link", "pandar64")
 
 
 def test_a_cloud_is_known_by_its_first_message_that_can_be_read(tmp_path: Path):
@@ -149,7 +155,7 @@ def test_a_cloud_is_known_by_its_first_message_that_can_be_read(tmp_path: Path):
     others = [entry._replace(topic="/other/points") for entry in entries if entry.topic == LIDAR]
     coloured = [others[0], *recordings.changed(others[1:], "/other/points", colour)]
     found = rig_of(sorted([*entries, *coloured], key=lambda e: e.log_time), tmp_path / "bag")
-    assert (found.lidars, found.camera_clouds) == ((LIDAR,), ("/other/points",))
+    assert (found.lidars, [*found.other_clouds]) == ((LIDAR,), ["/other/points"])
 
 
 def test_a_rig_that_stays_incomplete_is_refused_with_recording_and_camera(tmp_path: Path):
