@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from cvcdepth_core.errors import CvcDepthError, NotPromotedError
-from cvcdepth_ros.commands import bench, check, evaluate, export, finetune, inspect, play, rig, run
+from cvcdepth_ros.commands import bench, check, evaluate, export, finetune, import_weights, inspect, play, rig, run
 from cvcdepth_ros.installation import package_version
 
 PROGRAM = "cvcdepth"
@@ -38,6 +38,7 @@ COMMANDS: Mapping[str, Command] = {
     "run": run,
     "evaluate": evaluate,
     "finetune": finetune,
+    "import": import_weights,
     "play": play,
     "bench": bench,
     "export": export,

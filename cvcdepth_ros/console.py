@@ -5,9 +5,13 @@ import argparse
 import json
 import math
 import sys
+import textwrap
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol
+
+COLUMNS = 80
+"""Width of a terminal that everything for people fits, where it can."""
 
 
 class ProgressBar(Protocol):
@@ -56,6 +60,19 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]], numbers: Collect
         for row in (header, *rows)
     )
     return "\n".join(line.rstrip() for line in lines)
+
+
+def paragraph(text: str) -> str:
+    """Return the text in lines of at most 80 columns; what has no spaces, like a path, is not broken."""
+    return textwrap.fill(text, COLUMNS, break_long_words=False, break_on_hyphens=False)
+
+
+def shortened(text: str, width: int) -> str:
+    """Return at most `width` characters of a name: its beginning and its end, which tell it from others."""
+    if len(text) <= width:
+        return text
+    end = (width - 1) // 2
+    return f"{text[: width - 1 - end]}…{text[len(text) - end :]}"
 
 
 def print_result(result: Mapping[str, Any], text: str, as_json: bool) -> None:

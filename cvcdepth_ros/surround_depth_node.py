@@ -14,13 +14,15 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
+from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from cvcdepth_core.errors import CvcDepthError
 from cvcdepth_core.estimator import DepthEstimator
 from cvcdepth_core.rig.rig_file import RigLayout, load_rig_layout
-from cvcdepth_ros.live.camera_states import CameraCondition, CameraState
+from cvcdepth_ros.live.problem_log import ProblemLog
 from cvcdepth_ros.live.process_setup import prepare_process, return_memory
+from cvcdepth_ros.live.set_progress import NodeClock
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
 from cvcdepth_ros.node.diagnostics import ERROR, OK, WARN, status
 from cvcdepth_ros.node.live_rig import LiveRigDiscovery
@@ -31,12 +33,13 @@ from cvcdepth_ros.node.parameters import (
     NodeParameters,
     declare_parameters,
     read_parameters,
+    unknown_parameters,
 )
 from cvcdepth_ros.node.session import SurroundSession
 
 _POLL_SECONDS = 0.25
 _DIAGNOSTICS_SECONDS = 1.0
-_HEALTHY = CameraCondition(CameraState.OK)
+_CLOCK_TOPIC = "/clock"
 
 _HELP = """example:
   surround_depth_node --ros-args -p rig:=rig.yaml -p checkpoint:=model.safetensors
@@ -52,13 +55,15 @@ class SurroundDepthNode(ManagedNode):
     def __init__(self) -> None:
         super().__init__("surround_depth")
         declare_parameters(self)
+        for line in unknown_parameters(self):
+            self.get_logger().warning(line)
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self._settings: NodeParameters | None = None
         self._estimator: DepthEstimator | None = None
         self._layout: RigLayout | None = None
         self._discovery: LiveRigDiscovery | None = None
         self._session: SurroundSession | None = None
-        self._reported: dict[str, CameraCondition] = {}
+        self._problem_log = ProblemLog(self.get_logger())
         self._refused = 0
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         # Steady time: with use_sim_time and no /clock yet, these must run all the same.
@@ -102,7 +107,7 @@ class SurroundDepthNode(ManagedNode):
             self._discovery.close()
             self._discovery = None
         session, self._session = self._session, None
-        self._reported = {}
+        self._problem_log.forget_cameras()
         if session is None:
             return True
         for stage, summary in session.latencies.summaries().items():
@@ -165,24 +170,26 @@ class SurroundDepthNode(ManagedNode):
     def _poll(self) -> None:
         if self._discovery is not None:
             self._await_rig(self._discovery)
-        if self._session is not None:
-            self._session.poll()
-            self._report(self._session.conditions())
-            self._report_refusals(self._session.refused, self._session.problem)
+        session = self._session
+        if session is not None:
+            session.poll()
+            self._report_refusals(session.refused, session.problem)
+        conditions = session.conditions() if session else {}
+        self._problem_log.tell(self._problems(), conditions, is_matching=session is None or session.is_matching)
 
-    def _report(self, conditions: dict[str, CameraCondition]) -> None:
-        """Log what is wrong with each camera once, when it begins, and its end."""
-        for camera, condition in conditions.items():
-            former = self._reported.get(camera, _HEALTHY)
-            if condition == former:
-                continue
-            if condition == _HEALTHY:  # rclpy wants every line of code to log with one severity
-                self.get_logger().info(f"camera {camera}: ok")
-            elif condition.state != former.state:
-                self.get_logger().warning(f"camera {camera}: {condition.text}")
-            else:  # the reason may be another with every image
-                self.get_logger().warning(f"camera {camera}: {condition.text}", throttle_duration_sec=5.0)
-        self._reported = conditions
+    def _problems(self) -> dict[str, str]:
+        """Return what is wrong with the whole of it, by subject, each with its remedy; empty texts for what is not."""
+        session, clock = self._session, self._node_clock()
+        return {
+            "rig auto": self._discovery.problem() if self._discovery else "",
+            "clock": clock.problem if session else "",
+            "sets": session.standstill(clock) if session else "",
+            "cross-view consistency": session.overlap_findings() if session else "",
+        }
+
+    def _node_clock(self) -> NodeClock:
+        is_simulated = bool(self.get_parameter("use_sim_time").value)
+        return NodeClock(is_simulated, has_publisher=self.count_publishers(_CLOCK_TOPIC) > 0)
 
     def _report_refusals(self, count: int, reason: str) -> None:
         if count > self._refused and reason:
@@ -190,7 +197,7 @@ class SurroundDepthNode(ManagedNode):
         self._refused = count
 
     def _publish_diagnostics(self) -> None:
-        statuses = [self._node_status(), *(self._session.diagnostics() if self._session else [])]
+        statuses = [self._node_status(), *(self._session.diagnostics(self._node_clock()) if self._session else [])]
         for entry in statuses:
             entry.name = f"{self.get_name()}: {entry.name}"
             entry.hardware_id = self.get_fully_qualified_name()
@@ -203,7 +210,7 @@ class SurroundDepthNode(ManagedNode):
         if self.failure:
             level, message = ERROR, self.failure
         elif self._discovery is not None:
-            level, message = WARN, self._discovery.problem()
+            level, message = WARN, f"rig auto: {self._discovery.problem()}"
         elif self._session is None:
             message = "inactive" if self._settings else "unconfigured"
         return status(level, "node", message, {"unforeseen errors": self.errors})
@@ -246,16 +253,18 @@ class SurroundDepthNode(ManagedNode):
 def main(args: Sequence[str] | None = None) -> None:
     """Run the node until it is interrupted or terminated."""
     arguments = list(sys.argv if args is None else args)
-    _parse_command_line(remove_ros_args(arguments)[1:])
     prepare_process()
-    # rclpy ends the spinning on SIGINT as on SIGTERM. A KeyboardInterrupt besides would come in the middle of anything:
-    # while a message is taken, rclpy's extension makes a RuntimeError of it.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    rclpy.init(args=arguments)
     try:
+        _parse_command_line(remove_ros_args(arguments)[1:])
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         node = SurroundDepthNode()
-    except Exception as error:  # rclpy raises many kinds for a parameter override that is wrong
+    except Exception as error:  # rclpy raises many kinds for arguments or a parameter override that are wrong
         sys.exit(f"surround_depth_node: {str(error).splitlines()[0]}")
+    # rclpy's own handlers would end the context at once, and with it the log, while there is still something to say.
+    # A KeyboardInterrupt would come in the middle of anything: while a message is taken, rclpy's extension makes a
+    # RuntimeError of it. `ros2 launch` sends SIGINT to the group and again to each child; that changes nothing here.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: node.request_end())
     with node.survives_errors():
         node.autostart()
     node.spin()
@@ -264,9 +273,6 @@ def main(args: Sequence[str] | None = None) -> None:
 
 def _end(node: SurroundDepthNode) -> None:
     """Stop within two seconds, also in the middle of inference or of building a network."""
-    # `ros2 launch` sends SIGINT to the group and again to each child; the second must not break the clean-up.
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
     finished = node.stop()
     if node.is_abandoned or not finished:
         # A thread inside an inference or a compiler cannot be stopped; leaving is safe, for nothing of it is published.

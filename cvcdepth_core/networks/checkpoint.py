@@ -109,6 +109,18 @@ def import_released(directory: str | Path, spec: DepthModelSpec) -> Checkpoint:
     return checkpoint
 
 
+def half_precision(state: State) -> dict[str, Tensor]:
+    """Return the floating-point tensors in half precision; counters stay as they are."""
+    return {name: tensor.half() if tensor.is_floating_point() else tensor for name, tensor in state.items()}
+
+
+def is_pickle(path: Path) -> bool:
+    """Whether a file begins as `torch.save` writes them. Raises OSError when it cannot be read."""
+    with path.open("rb") as file:
+        beginning = file.read(2)
+    return beginning == b"PK" or beginning[:1] == pickle.PROTO
+
+
 def load_imagenet_encoder(encoder: Encoder, path: str | Path) -> None:
     """Start `encoder` from an ImageNet classifier's file; raises CheckpointError naming the file.
 
@@ -175,10 +187,8 @@ def _read_safetensors(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
 
 
 def _why_unreadable(path: Path) -> str:
-    with path.open("rb") as file:
-        beginning = file.read(2)
-    if beginning == b"PK" or beginning[:1] == pickle.PROTO:
-        return "is a pickle (torch.save), expected safetensors; import_released converts the released weights"
+    if is_pickle(path):
+        return "is a pickle (torch.save), expected safetensors; `cvcdepth import` converts released weights"
     return "is damaged or not a safetensors file"
 
 

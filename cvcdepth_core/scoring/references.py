@@ -37,6 +37,11 @@ class FixedDepth:
         self._depth = depth
         self._fx = fx
 
+    @property
+    def depth(self) -> NDArray[np.float32]:
+        """[N, H, W] metres."""
+        return self._depth
+
     def estimate(self, surround: SurroundPictures) -> NDArray[np.float32]:
         """Return the depth [N, H, W]; ConfigError when the calibration is not the one it was made for."""
         if not np.array_equal(surround.fx, self._fx):
@@ -52,6 +57,18 @@ def constant_depth(
         raise ConfigError(f"constant depth is {metres} m, must be positive")
     depth = np.full((len(rig.cameras), height, width), metres, dtype=np.float32)
     return FixedDepth(depth, SurroundPreprocessor(rig, height, width).intrinsics[:, 0, 0], f"constant {metres:g} m")
+
+
+def best_constant(truth: NDArray[np.float64]) -> float:
+    """Return the depth whose mean relative error to `truth` [M] (metres) is least; NaN for no truth.
+
+    sum |c - t| / t is least at the median of t weighted by 1 / t.
+    """
+    if not truth.size:
+        return math.nan
+    ascending = np.sort(truth)
+    weights = np.cumsum(1.0 / ascending)
+    return float(ascending[np.searchsorted(weights, weights[-1] / 2)])
 
 
 def ground_plane_depth(

@@ -1,13 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Both networks as a training begins with them: with random weights, or with those of a checkpoint."""
+"""Both networks as a training begins with them: with random weights, those of a checkpoint, or ImageNet encoders."""
 
 from __future__ import annotations
 
+import math
+from pathlib import Path
+
 import torch
 
-from cvcdepth_core.errors import CheckpointError
-from cvcdepth_core.networks import PoseNet, build_depth_network
-from cvcdepth_core.networks.checkpoint import Checkpoint, load_network_state
+from cvcdepth_core.errors import CheckpointError, ConfigError
+from cvcdepth_core.networks import DepthNet, PoseNet, build_depth_network
+from cvcdepth_core.networks.checkpoint import Checkpoint, load_imagenet_encoder, load_network_state
+from cvcdepth_core.networks.registry import DepthModelSpec
+from cvcdepth_core.networks.rig_images import DepthNetwork
 from cvcdepth_core.training.config import TrainingConfig
 from cvcdepth_core.training.model import SurroundModel
 
@@ -26,6 +31,41 @@ def build_surround_model(config: TrainingConfig, start: Checkpoint | None = None
         load_network_state(depth_net, start.depth_net, origin=f"{start.path}: depth network")
         if start.pose_net:
             load_network_state(pose_net, start.pose_net, origin=f"{start.path}: pose network")
+    return _surround_model(config, depth_net, pose_net)
+
+
+def build_imagenet_model(config: TrainingConfig, classifier: Path, initial_depth: float) -> SurroundModel:
+    """Return both networks of `config` with encoders from an ImageNet classifier's file, all else random by its seed.
+
+    The depth network begins with a constant depth of `initial_depth` metres for a camera with fx = focal_scale: from
+    the sigmoid's middle, which is nearer than a metre, the first warps miss their images (on the sample: Abs Rel 0.90
+    after 130 steps, against 0.49 from 8 m). Raises ConfigError where that is outside of the depth range or the encoders
+    differ, CheckpointError, naming the file, where it does not fit them.
+    """
+    if config.pose.encoder != config.depth.encoder:
+        raise ConfigError(
+            f"pose.encoder is {config.pose.encoder}, depth.encoder {config.depth.encoder}; one ImageNet file starts "
+            "both only when they are the same"
+        )
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)
+        depth_net, pose_net = DepthNet(config.depth.encoder), PoseNet(config.pose.encoder)
+    for encoder in (depth_net.depth_encoder, pose_net.pose_encoder):
+        load_imagenet_encoder(encoder, classifier)
+    _start_at_depth(depth_net, config.depth, initial_depth)
+    return _surround_model(config, depth_net, pose_net)
+
+
+def _start_at_depth(depth_net: DepthNet, spec: DepthModelSpec, metres: float) -> None:
+    """Set the head's bias so that a camera with fx = focal_scale begins near a depth of `metres`."""
+    if not spec.min_depth < metres < spec.max_depth:
+        raise ConfigError(f"initial depth is {metres}, expected between {spec.min_depth} and {spec.max_depth}")
+    disparity = (1 / metres - 1 / spec.max_depth) / (1 / spec.min_depth - 1 / spec.max_depth)
+    bias = depth_net.depth_decoder.decoder[-1].get_parameter("conv.bias")
+    torch.nn.init.constant_(bias, math.log(disparity / (1 - disparity)))
+
+
+def _surround_model(config: TrainingConfig, depth_net: DepthNetwork, pose_net: PoseNet) -> SurroundModel:
     return SurroundModel(
         depth_net,
         pose_net,

@@ -25,7 +25,7 @@ from cvcdepth_ros.bench.baseline_cloud import baseline_cloud
 from cvcdepth_ros.live.mailbox import MailboxStatistics
 from cvcdepth_ros.live.process_setup import prepare_process
 from cvcdepth_ros.messages.conversion import ros_message_class, ros_message_factory, stamp_ns
-from cvcdepth_ros.node.diagnostics import SynchronisationStatus, inference_status
+from cvcdepth_ros.node.diagnostics import inference_status, synchronisation_status
 from cvcdepth_ros.node.parameters import declare_parameters, read_parameters
 from cvcdepth_ros.node.subscriptions import CameraInputs
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
@@ -55,7 +55,6 @@ class BaselineNode(Node):  # type: ignore[misc] # rclpy is not annotated
         }
         self._latencies = StageLatencies()
         self._counters = Counter({"published": 0, "refused": 0})
-        self._synchronisation = SynchronisationStatus(self._settings.max_age)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._inputs = CameraInputs(self, layout, self._settings.reliable, self._on_image, lambda *_: None)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -87,7 +86,7 @@ class BaselineNode(Node):  # type: ignore[misc] # rclpy is not annotated
 
     def _publish_diagnostics(self) -> None:
         statuses = [
-            self._synchronisation.status(self._synchroniser.statistics(), MailboxStatistics(), self._counters),
+            synchronisation_status(self._synchroniser.statistics(), MailboxStatistics(), self._counters),
             inference_status(self._latencies.summaries(), MailboxStatistics(), "", self._estimator.model_id),
         ]
         for entry in statuses:

@@ -4,6 +4,7 @@
 import argparse
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin
 
@@ -11,6 +12,7 @@ from pydantic import ValidationError
 
 from cvcdepth_core.errors import ConfigError, first_validation_message
 from cvcdepth_ros.console import non_negative, positive, progress_bar
+from cvcdepth_ros.installation import share_directory
 from cvcdepth_ros.settings import ModelSettings
 
 if TYPE_CHECKING:
@@ -121,6 +123,22 @@ def settings_from(arguments: argparse.Namespace, settings: type[SettingsT]) -> S
         field, _, reason = first_validation_message(error).partition(":")
         arguments.usage_error(f"argument --{field.replace('_', '-')}:{reason}")
         raise
+
+
+def training_file(name: str) -> Path:
+    """Return the training file that is meant: a file, or a shipped one by its stem, as in `finetune`.
+
+    ConfigError names the shipped ones, the nearest first, when there is none.
+    """
+    path = Path(name).expanduser()
+    if path.is_file():
+        return path
+    shipped = {found.stem: found for found in sorted((share_directory() / "config" / "training").rglob("*.yaml"))}
+    if name in shipped:
+        return shipped[name]
+    nearest = get_close_matches(path.stem, shipped, n=1)
+    hint = f"did you mean {nearest[0]}? " if nearest else ""
+    raise ConfigError(f"{name}: no such file, and no shipped training file; {hint}There are {', '.join(shipped)}")
 
 
 def window_ns(arguments: argparse.Namespace, recording_start: int) -> tuple[int, int | None]:

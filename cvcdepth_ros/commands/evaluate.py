@@ -25,7 +25,6 @@ from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings, uniqu
 from cvcdepth_ros.reports import REPORT_FILE, can_draw_report
 
 if TYPE_CHECKING:
-    from cvcdepth_core.scoring.scores import Score
     from cvcdepth_ros.evaluation.measuring import RecordingScores
     from cvcdepth_ros.evaluation.result import EvaluationResult
     from cvcdepth_ros.evaluation.workers import Pool
@@ -125,6 +124,7 @@ def _evaluated(
     arguments: argparse.Namespace, settings: EvaluationSettings, folder: Path
 ) -> "tuple[Path, dict[str, Any], str]":
     """Write one model's results; return their folder and what to print."""
+    from cvcdepth_ros.commands.evaluation_tables import evaluation_text
     from cvcdepth_ros.evaluation.image_scores import write_csv
 
     if settings.notice:
@@ -140,7 +140,7 @@ def _evaluated(
         from cvcdepth_ros.reports.evaluation_page import write_report
 
         write_report(folder / REPORT_FILE, result, {job.name: job for job in jobs})
-    return folder, {name: value for name, value in content.items() if name != "rows"}, _text(result, folder)
+    return folder, {name: value for name, value in content.items() if name != "rows"}, evaluation_text(result, folder)
 
 
 def _result(
@@ -211,35 +211,6 @@ def _warn_of_losses(job: EvaluationJob, scores: "RecordingScores") -> None:
     refusals = scores.summary["truth_refused"]
     if refusals["count"]:
         warn(f"{job.path}: {refusals['count']} times no truth, the first: {refusals['reasons'][0]}")
-
-
-def _text(result: "EvaluationResult", folder: Path) -> str:
-    from cvcdepth_core.scoring.scores import ALL
-
-    summary, scaled = result.summary(), result.summary(scaling="median")
-    header = ("", "abs_rel", "median-scaled", "scale", "rmse", "delta_1", "coverage", "truth points")
-    ratios = result.scores.scale_ratios()
-    groups = [(group, summary.mean[group], scaled.mean[group], "") for group in result.scores.settings.groups]
-    cameras = [
-        (name, found[ALL], scaled.cameras[name][ALL], f"{ratios[name]:.2f}") for name, found in summary.cameras.items()
-    ]
-    lines = [
-        *(
-            [table(header, [_row(*row) for row in (*cameras, *groups)], numbers=range(1, len(header)))]
-            if result.truth_points
-            else []
-        ),
-        *(f"not evaluated: {failure.reason}" for failure in result.failed),
-        f"{len(result.sets)} sets of {len(result.recordings)} recordings, {result.truth_points} truth points",
-        f"{folder}, of {result.model.id}",
-    ]
-    return "\n".join(lines)
-
-
-def _row(name: str, score: "Score", scaled: "Score", ratio: str) -> tuple[str, ...]:
-    errors = (score.metrics["abs_rel"], scaled.metrics["abs_rel"])
-    others = (score.metrics["rmse"], score.metrics["delta_1"], score.coverage)
-    return (name, *(f"{e:.3f}" for e in errors), ratio, *(f"{number:.3f}" for number in others), str(score.truth))
 
 
 def _comparison_text(content: dict[str, Any]) -> str:

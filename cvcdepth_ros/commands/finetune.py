@@ -15,6 +15,7 @@ from cvcdepth_ros.commands.arguments import (
     add_skip,
     lidar_topics,
     refuse_unknown_checks,
+    training_file,
 )
 from cvcdepth_ros.console import print_result, table, warn
 from cvcdepth_ros.reports import REPORT_FILE, can_draw_report
@@ -32,7 +33,7 @@ best.safetensors is there only when the held-out part of the recordings proves i
 or without one by how well the depth explains the pictures. Otherwise the exit code is 3. The same command again goes on
 where a run that was interrupted or killed stood; with more epochs in the configuration, a finished one too."""
 EXAMPLES: tuple[str, ...] = (
-    "finetune drives/ --config config/training/finetune.yaml --from model.safetensors -o run",
+    "finetune drives/ --config finetune --from model.safetensors -o run",
     "finetune monday.mcap tuesday.mcap --config shuttle.yaml --from-scratch --rig shuttle_rig.yaml -o run",
 )
 
@@ -43,7 +44,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_recordings(parser)
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="RUN", help="the run's folder")
-    parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="training configuration (YAML)")
+    parser.add_argument(
+        "--config",
+        required=True,
+        metavar="FILE",
+        help="training configuration (YAML), or a shipped one by name: finetune",
+    )
     start = parser.add_mutually_exclusive_group(required=True)
     start.add_argument(
         "--from", dest="start", metavar="CHECKPOINT", help="weights to start from; 'default' are the package's own"
@@ -66,7 +72,7 @@ def execute(arguments: argparse.Namespace) -> None:
     from cvcdepth_ros.finetuning.run import BEST_FILE
 
     refuse_unknown_checks(arguments)
-    config = _training_config(arguments.config)
+    config = _training_config(training_file(arguments.config))
     with launched_processes() as processes:
         with_report = processes.is_first and can_draw_report()
         finished = _fine_tuned(arguments, config, processes)

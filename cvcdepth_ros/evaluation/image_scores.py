@@ -86,6 +86,25 @@ def image_scores(scores: Scores, agreement: Sequence[AgreementTable]) -> Iterato
             ]
 
 
+def label_free_by_camera(scores: Scores, agreement: Sequence[AgreementTable]) -> dict[str, LabelFree]:
+    """Return each camera's label-free scores, the means over its images that have any."""
+    found: dict[str, list[NDArray[np.float64]]] = {}
+    for table, compared in zip(scores.images, agreement, strict=True):
+        numbers = _label_free(compared, len(table), table.cameras)
+        for camera, name in enumerate(table.cameras):
+            found.setdefault(name, []).append(numbers[:, camera])
+    return {
+        name: LabelFree(*(_known_mean(column) for column in np.concatenate(parts).T.tolist()))
+        for name, parts in found.items()
+    }
+
+
+def mean_label_free(cameras: Iterable[LabelFree]) -> LabelFree:
+    """Return the means over the cameras that have a value."""
+    columns = list(zip(*cameras, strict=True)) or [()] * len(LabelFree._fields)
+    return LabelFree(*map(_known_mean, columns))
+
+
 def correlations(sets: Sequence[SetScore]) -> dict[str, float]:
     """Return each label-free score's rank correlation with Abs Rel over the sets; NaN where it is undefined."""
     errors = [found.abs_rel for found in sets]

@@ -28,6 +28,7 @@ from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_core.visualization import Points
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.evaluation.job import EvaluationJob
+from cvcdepth_ros.evaluation.references import ReferenceScores, ReferenceScoring
 from cvcdepth_ros.messages.cloud_sources import describe_left_out_clouds
 from cvcdepth_ros.recordings.replay import DepthReplay, RecordedImage, SurroundReplay
 from cvcdepth_ros.recordings.rig import RecordedRig
@@ -91,6 +92,8 @@ class RecordingScores:
     agreement: AgreementTable
     log_times: NDArray[np.int64]
     """[S] when each set was recorded, ns."""
+    references: Mapping[str, ReferenceScores]
+    """What looks at no picture, by `REFERENCES`; flat ground is missing where the ground is not below every camera."""
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Return everything as arrays that numpy stores without pickling."""
@@ -99,21 +102,33 @@ class RecordingScores:
             "summary": self.summary,
             "scores": self.scores.to_json(),
             "pairs": self.agreement.pairs,
+            "references": {
+                name: {"scores": found.scores.to_json(), "pairs": found.agreement.pairs}
+                for name, found in self.references.items()
+            },
         }
         text = np.frombuffer(json.dumps(described).encode(), dtype=np.uint8)
-        return {"described": text, "agreement": self.agreement.columns, "log_times": self.log_times}
+        arrays = {f"agreement_{name}": found.agreement.columns for name, found in self.references.items()}
+        return {"described": text, "agreement": self.agreement.columns, "log_times": self.log_times, **arrays}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> RecordingScores:
         """Undo `to_arrays`; KeyError, ValueError or ConfigError where the arrays are others."""
         described = json.loads(arrays["described"].tobytes())
-        pairs = [(kind, camera, other) for kind, camera, other in described["pairs"]]
+        references = {
+            name: ReferenceScores(
+                Scores.from_json(found["scores"]),
+                AgreementTable(map(tuple, found["pairs"]), arrays[f"agreement_{name}"]),
+            )
+            for name, found in described["references"].items()
+        }
         return cls(
             described["name"],
             described["summary"],
             Scores.from_json(described["scores"]),
-            AgreementTable(pairs, arrays["agreement"]),
+            AgreementTable(map(tuple, described["pairs"]), arrays["agreement"]),
             arrays["log_times"],
+            references,
         )
 
 
@@ -149,7 +164,11 @@ class RecordingEvaluation:
     def scores(self, progress: Progress | None = None) -> RecordingScores:
         """Score every set of the job's part. Raises RecordingError, saying why, when there is none."""
         start, stop = self.window
-        scoring = _Scoring(self.job, self.replay.rig.names, self.latencies)
+        spec = self.depths.estimator.spec
+        references = ReferenceScoring(
+            self.job, self.replay.rig, (spec.height, spec.width), is_without_truth=not self.truth.topics
+        )
+        scoring = _Scoring(self.job, self.replay.rig.names, references, self.latencies)
         for measured in self.sets(start, stop):
             scoring.add(measured)
             if progress is not None:
@@ -232,8 +251,11 @@ class Remeasuring:
 class _Scoring:
     """Adds up one recording's sets."""
 
-    def __init__(self, job: EvaluationJob, cameras: Sequence[str], latencies: StageLatencies) -> None:
+    def __init__(
+        self, job: EvaluationJob, cameras: Sequence[str], references: ReferenceScoring, latencies: StageLatencies
+    ) -> None:
         self._job = job
+        self.references = references
         self._latencies = latencies
         self._scorer = SurroundScorer(job.name, cameras, job.settings.scores)
         self._agreement = AgreementTable()
@@ -245,7 +267,9 @@ class _Scoring:
     def add(self, measured: MeasuredSet) -> None:
         """Score one set; sets come in order."""
         with self._latencies.measure("score"):
-            points = self._scorer.add(measured.stamp_ns, measured.samples())
+            samples = measured.samples()
+            points = self._scorer.add(measured.stamp_ns, samples)
+            self.references.add(measured.stamp_ns, samples, measured.truth)
         self.truth_points += points
         self.sets_with_truth += points > 0
         with self._latencies.measure("label-free"), torch.inference_mode():
@@ -260,18 +284,20 @@ class _Scoring:
     def result(self, summary: dict[str, Any]) -> RecordingScores:
         """Return what was found."""
         log_times = np.array(self._log_times, dtype=np.int64)
-        return RecordingScores(self._job.name, summary, self._scorer.scores(), self._agreement, log_times)
+        scores, references = self._scorer.scores(), self.references.result()
+        return RecordingScores(self._job.name, summary, scores, self._agreement, log_times, references)
 
     def _compare(self, measured: MeasuredSet) -> None:
         stamp, rig, posed = measured.stamp_ns, measured.estimated.rig, measured.posed
         limit = self._job.settings.max_depth
-        self._agreement.add(self.sets, spatial_rows(rig, posed, limit))
+        earlier = self._earlier[1] if self._earlier and stamp - self._earlier[0] <= _LONGEST_STEP_NS else None
         if measured.world_T_base is None:
-            self._earlier = None
-            return
-        if self._earlier is not None and stamp - self._earlier[0] <= _LONGEST_STEP_NS:
-            self._agreement.add(self.sets, temporal_rows(rig, posed, self._earlier[1], limit))
-        self._earlier = stamp, posed
+            earlier = None
+        self._agreement.add(self.sets, spatial_rows(rig, posed, limit))
+        if earlier is not None:
+            self._agreement.add(self.sets, temporal_rows(rig, posed, earlier, limit))
+        self.references.compare(self.sets, rig, posed, earlier)
+        self._earlier = None if measured.world_T_base is None else (stamp, posed)
 
 
 def _summary(evaluation: RecordingEvaluation, scoring: _Scoring) -> dict[str, Any]:
@@ -296,6 +322,7 @@ def _summary(evaluation: RecordingEvaluation, scoring: _Scoring) -> dict[str, An
             "refused": depths.refused.count,
         },
         "truth_points": scoring.truth_points,
+        "no_flat_ground": scoring.references.problem or None,
         "refused": depths.refused.reasons + replay.unreadable.reasons,
         "truth_refused": {"count": truth.refused.count, "reasons": truth.refused.reasons[:10]},
         "damage": recording.damage,

@@ -13,12 +13,23 @@ from typing import Any, NamedTuple
 
 from cvcdepth_core.errors import ConfigError, RecordingError
 from cvcdepth_core.files import nan_to_null
+from cvcdepth_core.networks.checkpoint import load_checkpoint
 from cvcdepth_core.scoring.comparison import Comparison, compare
 from cvcdepth_core.scoring.consistency import AgreementTable, summarise_agreement
-from cvcdepth_core.scoring.scores import SCALINGS, EvaluationProtocol, Scaling, Scores, Summary
-from cvcdepth_ros.evaluation.image_scores import ImageScore, SetScore, correlations, image_scores
+from cvcdepth_core.scoring.scores import ALL, SCALINGS, EvaluationProtocol, Scaling, Score, Scores, Summary
+from cvcdepth_ros.evaluation.image_scores import (
+    ImageScore,
+    LabelFree,
+    SetScore,
+    correlations,
+    image_scores,
+    label_free_by_camera,
+    mean_label_free,
+)
 from cvcdepth_ros.evaluation.job import Dependencies, EvaluationJob
 from cvcdepth_ros.evaluation.measuring import RecordingScores
+from cvcdepth_ros.evaluation.references import REFERENCES
+from cvcdepth_ros.evaluation.trained_on import SeenSets, seen_in_training, trained_parts
 
 SCHEMA = 2
 _DECIDE_WHAT_IS_MEASURED = ("rig", "base_frame", "tolerance", "lidar", "lidar_tolerance", "no_occlusion_filter")
@@ -45,6 +56,20 @@ class Model(NamedTuple):
     """Hash of the checkpoint's bytes."""
 
 
+class Reference(NamedTuple):
+    """What looks at no picture, on all recordings that it could be scored on."""
+
+    scores: Mapping[Scaling, Score]
+    """Per image, the mean over the images and then over the cameras, all pixels together."""
+    label_free: LabelFree
+    """NaN where there is truth: depth that looks at no picture is not compared with itself then."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the content for JSON, NaN as null."""
+        scores = {scaling: score.to_json() for scaling, score in self.scores.items()}
+        return {"scores": scores, "label_free": nan_to_null(self.label_free._asdict())}
+
+
 @dataclass(frozen=True)
 class EvaluationResult:
     """One model on all recordings."""
@@ -55,6 +80,8 @@ class EvaluationResult:
     recordings: Sequence[RecordingScores]
     """Sorted by name, so that nothing depends on the order in which they were finished."""
     failed: Sequence[Failure]
+    trained_on: Sequence[SeenSets] = ()
+    """The sets among those scored that the checkpoint had been trained on, as far as it says."""
 
     @classmethod
     def from_outcomes(
@@ -72,7 +99,9 @@ class EvaluationResult:
         path = jobs[0].settings.checkpoint_path
         model = Model(scores[0].summary["model"], str(path) if path else None, depends_on.sha256)
         ordered = sorted(scores, key=lambda found: found.name)
-        return cls(depends_on.version, model, jobs[0].configuration(), ordered, sorted(failed))
+        parts = trained_parts(load_checkpoint(path)) if path else []
+        seen = seen_in_training(parts, (table for found in ordered for table in found.scores.images))
+        return cls(depends_on.version, model, jobs[0].configuration(), ordered, sorted(failed), seen)
 
     @cached_property
     def scores(self) -> Scores:
@@ -99,6 +128,24 @@ class EvaluationResult:
         """Return the means over all recordings."""
         return self.scores.summary(protocol, scaling)
 
+    @cached_property
+    def label_free(self) -> dict[str, LabelFree]:
+        """The label-free scores of every camera."""
+        return label_free_by_camera(self.scores, self.agreement)
+
+    @cached_property
+    def references(self) -> dict[str, Reference]:
+        """The references by name, in the order of `REFERENCES`."""
+        names = [name for name in REFERENCES if any(name in found.references for found in self.recordings)]
+        return {name: self._reference(name) for name in names}
+
+    def _reference(self, name: str) -> Reference:
+        found = [recording.references[name] for recording in self.recordings if name in recording.references]
+        scores = Scores.merged(one.scores for one in found)
+        label_free = label_free_by_camera(scores, [one.agreement for one in found])
+        by_scaling = {scaling: scores.summary("image", scaling).mean[ALL] for scaling in SCALINGS}
+        return Reference(by_scaling, mean_label_free(label_free.values()))
+
     @property
     def truth_points(self) -> int:
         """How many pixels have truth inside the depth limits."""
@@ -116,7 +163,9 @@ class EvaluationResult:
             "scores": {p: {s: self.summary(p, s).to_json() for s in SCALINGS} for p in PROTOCOLS},
             "scale_ratio": {p: nan_to_null(self.scores.scale_ratios(p)) for p in PROTOCOLS},
             "label_free": self._label_free(),
+            "references": {name: reference.to_json() for name, reference in self.references.items()},
             "recordings": [recording.summary for recording in self.recordings],
+            "trained_on": [seen._asdict() for seen in self.trained_on],
             "failed": [failure._asdict() for failure in self.failed],
             "rows": self.scores.to_json(),
         }
@@ -126,7 +175,11 @@ class EvaluationResult:
             {"kind": kind, "camera": camera, "other": other} | nan_to_null(found._asdict())
             for (kind, camera, other), found in summarise_agreement(self.agreement).items()
         ]
-        return {"pairs": pairs, "rank_correlation_with_abs_rel": nan_to_null(correlations(self.sets))}
+        means = {
+            "cameras": {name: nan_to_null(found._asdict()) for name, found in self.label_free.items()},
+            "mean": nan_to_null(mean_label_free(self.label_free.values())._asdict()),
+        }
+        return {"pairs": pairs, **means, "rank_correlation_with_abs_rel": nan_to_null(correlations(self.sets))}
 
 
 @dataclass(frozen=True)

@@ -1,15 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The inputs of a run, by name and hash: an interrupted run goes on with the same inputs only."""
+"""The inputs of a run, by name and hash (an interrupted run goes on with the same only), and what its weights know."""
 
 from __future__ import annotations
 
 import hashlib
 
+from cvcdepth_core.networks.checkpoint import Checkpoint
 from cvcdepth_core.rig.rig_file import RigLayout
+from cvcdepth_ros.evaluation.trained_on import TrainedPart, trained_parts
 from cvcdepth_ros.finetuning.preparation import Prepared
 from cvcdepth_ros.training_data.index import RecordingIndex
+from cvcdepth_ros.training_data.sample_choice import first_held_out
 
 _DIGITS = 12
+
+
+def trained_on(prepared: Prepared, held_out: float, start: Checkpoint | None) -> list[TrainedPart]:
+    """Return what the run's weights will have learned from, that of their start included."""
+    parts = trained_parts(start)
+    for index in prepared.indexes:
+        stamps = index.stamps[: first_held_out(index, held_out), index.anchor]
+        if len(stamps):
+            parts.append(TrainedPart.from_stamps(index.path.name, stamps))
+    return parts
 
 
 def inputs_of(prepared: Prepared, started_from: str) -> dict[str, str]:

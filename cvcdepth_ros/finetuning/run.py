@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,10 +18,11 @@ from cvcdepth_core.training.run_folder import CHECKPOINT_FILE
 from cvcdepth_core.training.starting_model import build_surround_model
 from cvcdepth_core.training.trainer import RunObserver, Trainer
 from cvcdepth_ros.evaluation.result import EvaluationResult
+from cvcdepth_ros.evaluation.trained_on import TrainedPart, to_metadata, trained_parts
 from cvcdepth_ros.finetuning.held_out import HeldOutPart, evaluate_checkpoint, held_out_parts, validation_jobs
 from cvcdepth_ros.finetuning.judgement import Verdict, judge
 from cvcdepth_ros.finetuning.preparation import Prepared, Source, prepare
-from cvcdepth_ros.finetuning.provenance import inputs_of
+from cvcdepth_ros.finetuning.provenance import inputs_of, trained_on
 from cvcdepth_ros.finetuning.tensorboard import TensorBoardObserver, has_tensorboard
 from cvcdepth_ros.finetuning.validation import CANDIDATE_FILE, HeldOutValidation
 from cvcdepth_ros.installation import package_version
@@ -91,7 +92,7 @@ def fine_tune(job: FinetuneJob, processes: Processes, warn: Callable[[str], None
     if parts:
         _keep_start(job, model)  # before the trainer fills the model with what a former call reached
     observers = [TensorBoardObserver(job.run)] if processes.is_first and has_tensorboard() else []
-    trainer = _trainer(job, model, batches, parts, processes, observers, inputs_of(prepared, job.started_from))
+    trainer = _trainer(job, model, batches, parts, processes, observers, prepared)
     if processes.is_first and trainer.progress.step == 0:
         _forget_former_run(job.run)
     before = _evaluated(job, parts, job.run / START_FILE, "before") if parts else None
@@ -123,9 +124,10 @@ def _trainer(
     parts: list[HeldOutPart],
     processes: Processes,
     observers: list[TensorBoardObserver],
-    inputs: Mapping[str, str],
+    prepared: Prepared,
 ) -> Trainer:
     config = job.config
+    learned_from = trained_on(prepared, config.recordings.held_out, job.start)
     watching: list[RunObserver] = [*observers]
     validation = None
     if parts:
@@ -138,16 +140,17 @@ def _trainer(
         job.run,
         own_device(resolve_device(job.device)),
         validation,
-        _metadata(job),
+        _metadata(job, learned_from),
         watching,
         processes,
-        inputs,
+        inputs_of(prepared, job.started_from),
     )
 
 
-def _metadata(job: FinetuneJob) -> dict[str, str]:
+def _metadata(job: FinetuneJob, learned_from: Sequence[TrainedPart]) -> dict[str, str]:
     config = job.config.model_dump_json()
-    return {"version": package_version(), "config": config, _START_KEY: job.started_from}
+    described = {"version": package_version(), "config": config, _START_KEY: job.started_from}
+    return described | to_metadata(learned_from)
 
 
 def _keep_start(job: FinetuneJob, model: SurroundModel) -> None:
@@ -155,7 +158,7 @@ def _keep_start(job: FinetuneJob, model: SurroundModel) -> None:
     path = job.run / START_FILE
     if not path.exists():
         states = (model.depth_net.state_dict(), model.pose_net.state_dict())
-        save_checkpoint(path, job.config.depth, *states, _metadata(job))
+        save_checkpoint(path, job.config.depth, *states, _metadata(job, trained_parts(job.start)))
     found = load_checkpoint(path).metadata.get(_START_KEY)
     if found != job.started_from:
         raise CheckpointError(f"{job.run}: its run started from {found}, now it is {job.started_from}")

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
 from cvcdepth_core.errors import ConfigError
-from cvcdepth_core.stamps import to_nanoseconds
+from cvcdepth_core.stamps import NANOSECONDS, to_nanoseconds
 from cvcdepth_ros.surround_sets.synchronizer import SurroundSet
 
 T = TypeVar("T")
@@ -47,7 +47,13 @@ class Mailbox(Generic[T]):
         self._last_sequence = -1
         self._closed = False
         self._statistics = MailboxStatistics()
+        self._stale_age: float | None = None
         self._changed = threading.Condition()
+
+    @property
+    def stale_age(self) -> float | None:
+        """Age in seconds of the last set that was dropped because of it; None when none was."""
+        return self._stale_age
 
     @property
     def closed(self) -> bool:
@@ -77,9 +83,12 @@ class Mailbox(Generic[T]):
         """Wait for a set that is fresh; None after `timeout` seconds (None: no limit), or as soon as closed."""
         deadline = None if timeout is None else time.monotonic() + timeout
         while (surround_set := self._take(deadline)) is not None:
-            fresh = self._max_age is None or self._clock() - surround_set.time_ns <= self._max_age
+            age = 0 if self._max_age is None else self._clock() - surround_set.time_ns
+            fresh = self._max_age is None or age <= self._max_age
             with self._changed:
                 self._count("delivered" if fresh else "stale")
+                if not fresh:
+                    self._stale_age = age / NANOSECONDS
             if fresh:
                 return surround_set
         return None

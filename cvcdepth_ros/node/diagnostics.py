@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node's statuses on `/diagnostics`, in diagnostic_updater's form: `node: subject`, level, values."""
 
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
@@ -53,32 +52,14 @@ def camera_status(
     return status(_LEVELS.get(condition.state, WARN), f"camera {camera}", condition.text, values)
 
 
-class SynchronisationStatus:
-    """Counts of matched, published and dropped sets, with a warning where none got through since the last status."""
-
-    def __init__(self, max_age: float) -> None:
-        """Name `max_age`, in seconds, in the warning."""
-        self._max_age = max_age
-        self._before: Counter[str] = Counter()
-
-    def status(
-        self, synchroniser: SynchronizerStatistics, mailbox: MailboxStatistics, counters: Mapping[str, int]
-    ) -> DiagnosticStatus:
-        """Return the status for these counts."""
-        values = {"matched": synchroniser.sets, **asdict(mailbox), **counters}
-        problem = self._problem(Counter(values))
-        message = f"{synchroniser.sets} sets matched, {counters['published']} published"
-        level = WARN if problem or not synchroniser.sets else OK
-        return status(level, "synchronisation", "; ".join(filter(None, (problem, message))), values)
-
-    def _problem(self, counted: Counter[str]) -> str:
-        new, self._before = counted - self._before, counted
-        if new["stale"] and not new["delivered"]:
-            age = f"max_age ({self._max_age:g} s)"
-            return f"every set is older than {age} in the node's time: do the clocks agree? see use_sim_time"
-        if new["skipped: rig not complete"] and not new["published"]:
-            return "sets are skipped: too few cameras are complete"
-        return ""
+def synchronisation_status(
+    synchroniser: SynchronizerStatistics, mailbox: MailboxStatistics, counters: Mapping[str, int], problem: str = ""
+) -> DiagnosticStatus:
+    """Return the counts of matched, published and dropped sets, and `problem`: why none gets through."""
+    values = {"matched": synchroniser.sets, **asdict(mailbox), **counters}
+    message = f"{synchroniser.sets} sets matched, {counters['published']} published"
+    level = WARN if problem or not synchroniser.sets else OK
+    return status(level, "synchronisation", "; ".join(filter(None, (problem, message))), values)
 
 
 def inference_status(

@@ -2,6 +2,7 @@
 """`rig:=auto`: find the cameras of a running system, their calibrations and their poses."""
 
 import time
+from collections.abc import Collection
 from functools import partial
 
 from rclpy.node import Node
@@ -11,12 +12,13 @@ from sensor_msgs.msg import CameraInfo
 
 from cvcdepth_core.errors import CvcDepthError
 from cvcdepth_core.rig.rig_file import CameraEntry, RigLayout
-from cvcdepth_ros.messages.camera_discovery import discover_cameras
+from cvcdepth_ros.messages.camera_discovery import COMPRESSED_IMAGE_TYPE, IMAGE_TYPE, discover_cameras
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
 from cvcdepth_ros.messages.transforms import TransformTree
 from cvcdepth_ros.node.subscriptions import StaticTransformInput, topic_types
 
 _SETTLING_SECONDS = 3.0
+_SHOWN = 3
 
 
 class LiveRigDiscovery:
@@ -28,6 +30,7 @@ class LiveRigDiscovery:
         self._base_frame = base_frame
         self._least = max(2, min_cameras)
         self._entries: tuple[CameraEntry, ...] = ()
+        self._unpaired: list[str] = []
         self._assembler: RigAssembler | None = None
         self._subscriptions: list[Subscription] = []
         self._tree = TransformTree()
@@ -56,13 +59,26 @@ class LiveRigDiscovery:
         self._refusal, self._changed = reason, time.monotonic()
 
     def problem(self) -> str:
-        """Return what is still missing."""
+        """Return what is still missing, and the remedy."""
         if len(self._entries) < self._least:
             names = ", ".join(entry.name for entry in self._entries) or "none"
             want = f"at least {self._least} cameras with image and camera_info topics"
-            return f"rig auto: waiting for {want}, found {names}"
+            return f"waiting for {want}, found {names}{self._hint()}"
         problems = self._assembler.problems() if self._assembler else {}
-        return "rig auto: " + next(iter(problems.values()), self._refusal or "waiting for the set of cameras to settle")
+        if not problems:
+            return self._refusal or "waiting for the set of cameras to settle"
+        first, *others = problems.values()
+        more = f" (and so for {len(others)} more of {len(self._entries)} cameras)" if others else ""
+        is_pose = self._assembler is not None and self._assembler.calibration_problem(next(iter(problems))) is None
+        remedy = f"; publish it on /tf_static, base_frame is {self._base_frame}" if is_pose else ""
+        return f"{first}{more}{remedy}"
+
+    def _hint(self) -> str:
+        """Return where cameras may be that were not found."""
+        if self._unpaired:
+            more = f" and {len(self._unpaired) - _SHOWN} more" if len(self._unpaired) > _SHOWN else ""
+            return f"; without camera_info beside them: {', '.join(self._unpaired[:_SHOWN])}{more}"
+        return "; are the drivers running, in this ROS_DOMAIN_ID?" if not self._entries else ""
 
     def close(self) -> None:
         """Drop all subscriptions."""
@@ -74,6 +90,8 @@ class LiveRigDiscovery:
         own = f"{self._node.get_fully_qualified_name()}/"
         types = {topic: names[0] for topic, names in topic_types(self._node).items() if not topic.startswith(own)}
         entries = tuple(discover_cameras(types))
+        images = {topic for topic, name in types.items() if name in (IMAGE_TYPE, COMPRESSED_IMAGE_TYPE)}
+        self._unpaired = sorted(topic for topic in images if not _has_info(topic, types))
         if entries == self._entries:
             return
         self._entries, self._changed = entries, time.monotonic()
@@ -93,3 +111,9 @@ class LiveRigDiscovery:
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
         self._subscriptions = []
+
+
+def _has_info(image_topic: str, topics: Collection[str]) -> bool:
+    """Whether a camera_info stands beside the image topic, or beside the one that it is a transport of."""
+    parts = image_topic.split("/")
+    return any("/".join([*parts[:-depth], "camera_info"]) in topics for depth in (1, 2))

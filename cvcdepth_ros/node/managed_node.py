@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any, TypeVar
 
-import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 
@@ -35,15 +34,29 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc] # rclpy is not annotated
         """Callbacks that raised an unforeseen error."""
         self.is_abandoned = False
         """Whether a thread is still busy that is no longer waited for."""
+        self._is_ending = False
         for service in self.services:
             if service.srv_name.endswith("/change_state"):
                 service.callback = partial(self._answer_change_state, service.callback)
 
+    def request_end(self) -> None:
+        """Have `spin` return and `wait_for` give up soon; may be called by a signal's handler."""
+        self._is_ending = True
+
+    @property
+    def is_ending(self) -> bool:
+        """Whether the node was asked to end, or its context has ended."""
+        return self._is_ending or not self.context.ok()
+
     def spin(self) -> None:
-        """Serve until the context ends."""
-        while self.context.ok():
+        """Serve until the end is requested, or the context ends."""
+        executor = SingleThreadedExecutor(context=self.context)
+        executor.add_node(self)
+        while not self.is_ending:
             with self.survives_errors():
-                rclpy.spin(self, SingleThreadedExecutor(context=self.context))
+                # Python's handlers of signals run between two callbacks: the executor must not wait long for one.
+                executor.spin_once(timeout_sec=_INTERRUPTION_SECONDS)
+        executor.remove_node(self)
 
     @contextmanager
     def survives_errors(self) -> Iterator[None]:
@@ -55,8 +68,8 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc] # rclpy is not annotated
 
     def report(self, error: Exception) -> str:
         """Log and count an unforeseen error; return its type and message."""
-        # A signal invalidates the context at once, and so whatever a callback has just asked rclpy for.
-        if self.context.ok():
+        # The end of the context invalidates whatever a callback has just asked rclpy for; work was interrupted by us.
+        if not self.is_ending:
             self.errors += 1
             self.get_logger().error("".join(traceback.format_exception(error)), throttle_duration_sec=5.0)
         return f"{type(error).__name__}: {error}"
@@ -81,7 +94,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc] # rclpy is not annotated
         future = pool.submit(work)
         pool.shutdown(wait=False)
         while not wait([future], _INTERRUPTION_SECONDS).done:
-            if not self.context.ok():
+            if self.is_ending:
                 self.is_abandoned = True
                 raise InterruptedError("the node ends")
         return future.result()

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node's parameters: one model gives their defaults, descriptions, ranges and checks."""
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from difflib import get_close_matches
 from typing import Any, Literal, get_args, get_origin
 
 from pydantic import Field, ValidationError
@@ -14,13 +15,15 @@ from cvcdepth_ros.settings import MatchingSettings, MissingCameraSettings, Model
 
 AUTO = "auto"
 
+_QOS_PREFIX = "qos_overrides."
+
 CHANGEABLE_WHILE_RUNNING = ("checkpoint", "cloud_stride", "cloud_min_range", "cloud_max_range", "cloud_voxel")
 
 
 class NodeParameters(OutputSettings, MissingCameraSettings, MatchingSettings, ModelSettings):
     """Everything that can be set; the docstring of each field is its ROS description."""
 
-    rig: str = ""
+    rig: str = AUTO
     """Rig file (YAML), or 'auto': find the cameras among the live topics and their poses on /tf_static."""
     base_frame: str = "base_link"
     """With rig 'auto': the vehicle's frame. A rig file names its own."""
@@ -69,6 +72,38 @@ def read_parameters(node: Node, changed: Iterable[Any] = ()) -> NodeParameters:
         return NodeParameters.model_validate(values)
     except ValidationError as error:
         raise ConfigError(f"parameter {first_validation_message(error)}") from error
+
+
+def unknown_parameters(node: Node) -> list[str]:
+    """Return a line for each value that was given, on the command line or in a file, to a parameter that is none.
+
+    Overrides of QoS are left out: their parameters are declared with their topics (`unknown_qos_overrides`).
+    """
+    given = [name for name in _overrides(node) if not name.startswith(_QOS_PREFIX)]
+    known = [*NodeParameters.model_fields, "use_sim_time"]
+    return [_unknown(name, known) for name in given if not node.has_parameter(name)]
+
+
+def unknown_qos_overrides(node: Node, expected_topics: Collection[str]) -> list[str]:
+    """Return a line for each override of QoS for a topic that the node neither has nor expects (full names)."""
+    declared = node.get_parameters_by_prefix(_QOS_PREFIX.rstrip("."))
+    topics = {name.split(".")[0] for name in declared} | set(expected_topics)
+    given = [name for name in _overrides(node) if name.startswith(_QOS_PREFIX) and not node.has_parameter(name)]
+    by_topic = {name: name.removeprefix(_QOS_PREFIX).split(".")[0] for name in given}
+    return [_unknown(name, sorted(topics), topic) for name, topic in by_topic.items() if topic not in topics]
+
+
+def _overrides(node: Node) -> Collection[str]:
+    """Return the names of the values that were given; rclpy has no public way to them."""
+    overrides: Mapping[str, Any] = getattr(node, "_parameter_overrides", {})
+    return overrides.keys()
+
+
+def _unknown(name: str, known: Sequence[str], part: str = "") -> str:
+    """Say that a parameter is none, with the known name that is nearest to it, or to a part of it."""
+    nearest = get_close_matches(part or name, known, n=1)
+    hint = f"; did you mean {name.replace(part or name, nearest[0])}?" if nearest else ""
+    return f"parameter {name} is unknown and has no effect{hint}"
 
 
 def _descriptor(name: str, field: FieldInfo) -> ParameterDescriptor:

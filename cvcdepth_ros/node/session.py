@@ -2,6 +2,7 @@
 """One active period of the node: its topics connected to the pipeline, and the state of each camera."""
 
 from contextlib import ExitStack, closing
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +18,17 @@ from cvcdepth_ros.live.camera_states import CameraCondition, CameraState, Camera
 from cvcdepth_ros.live.mailbox import Mailbox
 from cvcdepth_ros.live.picture_preparation import CameraImage
 from cvcdepth_ros.live.pipeline import SurroundPipeline
+from cvcdepth_ros.live.set_progress import NodeClock, SetProgress
 from cvcdepth_ros.messages.conversion import stamp_ns
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
 from cvcdepth_ros.node.diagnostics import (
-    SynchronisationStatus,
     camera_status,
     inference_status,
     model_status,
     overlap_status,
+    synchronisation_status,
 )
-from cvcdepth_ros.node.parameters import NodeParameters, read_parameters
+from cvcdepth_ros.node.parameters import NodeParameters, read_parameters, unknown_qos_overrides
 from cvcdepth_ros.node.publishers import SurroundOutputs
 from cvcdepth_ros.node.subscriptions import CameraInputs, StaticTransformInput
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
@@ -61,7 +63,7 @@ class SurroundSession:
         self._monitored_rig: Rig | None = None
         self._max_image_mb = parameters.max_image_mb
         self._offsets_ns = {camera.name: camera.stamp_offset_ns for camera in layout.cameras}
-        self._synchronisation = SynchronisationStatus(parameters.max_age)
+        self._progress = SetProgress(self._synchroniser.required, parameters.tolerance, parameters.max_age)
         self._is_finished = False
         with ExitStack() as opened:
             trace = None
@@ -88,10 +90,14 @@ class SurroundSession:
             self._inputs = opened.enter_context(closing(inputs))
             self._rebuild()
             self._opened = opened.pop_all()
+        for line in unknown_qos_overrides(node, self._inputs.image_topics):
+            node.get_logger().warning(line)
 
     def poll(self) -> None:
-        """Subscribe image topics that have appeared."""
+        """Subscribe image topics that have appeared, and follow how far the sets come. To be called regularly."""
         self._inputs.connect()
+        counts = {**asdict(self._mailbox.statistics()), **self._pipeline.counters}
+        self._progress.update(self._synchroniser.statistics(), counts)
 
     def set_model(self, estimator: DepthEstimator) -> None:
         """Use another network from the next set on; EngineError when it cannot run."""
@@ -122,6 +128,27 @@ class SurroundSession:
         return {name: condition(name, found) for name, found in troubles.items()}
 
     @property
+    def is_matching(self) -> bool:
+        """Whether sets come, or no images do."""
+        return self._progress.is_matching
+
+    @property
+    def has_idle_sets(self) -> bool:
+        """Whether sets came and nobody has subscribed to what would be made of them."""
+        counters = self._pipeline.counters
+        return bool(counters["skipped: no subscriber"]) and not counters["published"]
+
+    def standstill(self, node_clock: NodeClock) -> str:
+        """Return why images come but no set gets through, and the remedy; empty while they do."""
+        found = self.conditions().items()
+        reasons = {n: c.text for n, c in found if c.state not in (CameraState.OK, CameraState.UNMATCHED)}
+        return self._progress.problem(reasons, node_clock, self._mailbox.stale_age)
+
+    def overlap_findings(self) -> str:
+        """Return what the comparison of neighbouring cameras has found; empty where all is well."""
+        return "; ".join(map(str, self._overlaps.findings())) if self._overlaps else ""
+
+    @property
     def problem(self) -> str:
         """The reason why the last set was refused; empty when it was not."""
         return self._pipeline.problem
@@ -131,7 +158,7 @@ class SurroundSession:
         """Number of sets that were refused so far."""
         return self._pipeline.counters["refused"]
 
-    def diagnostics(self) -> list[DiagnosticStatus]:
+    def diagnostics(self, node_clock: NodeClock) -> list[DiagnosticStatus]:
         """Return the statuses of cameras, synchronisation, inference, model and overlaps."""
         statistics, mailbox = self._synchroniser.statistics(), self._mailbox.statistics()
         cameras = [
@@ -140,7 +167,7 @@ class SurroundSession:
         ]
         return [
             *cameras,
-            self._synchronisation.status(statistics, mailbox, self._pipeline.counters),
+            synchronisation_status(statistics, mailbox, self._pipeline.counters, self.standstill(node_clock)),
             inference_status(self.latencies.summaries(), mailbox, self.problem, self._estimator.model_id),
             model_status(self._estimator),
             *([overlap_status(self._overlaps)] if self._overlaps else []),

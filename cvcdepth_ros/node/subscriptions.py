@@ -59,6 +59,11 @@ class CameraInputs:
             raise
 
     @property
+    def image_topics(self) -> list[str]:
+        """The graph's names of the cameras' image topics, whether they are there or not."""
+        return [camera.image_topic for camera in self._cameras.values()]
+
+    @property
     def lost(self) -> dict[str, int]:
         """Messages that the middleware lost, by camera."""
         return {name: camera.lost for name, camera in self._cameras.items()}
@@ -95,7 +100,8 @@ class _CameraInput:
         self._camera = camera
         self._reliable = reliable
         self._on_image = on_image
-        self._image_topic = _resolved(node, camera.image_topic)
+        self.image_topic = _resolved(node, camera.image_topic)
+        """Its whole name, after remapping."""
         self._refusal = ""
         self.lost = 0
         self._images: Subscription | None = None
@@ -103,7 +109,7 @@ class _CameraInput:
 
     def connect(self, types: Mapping[str, Sequence[str]]) -> None:
         """Subscribe the images if their topic is there and has been tried neither with success nor without."""
-        known = [_IMAGE_CLASSES[name] for name in types.get(self._image_topic, ()) if name in _IMAGE_CLASSES]
+        known = [_IMAGE_CLASSES[name] for name in types.get(self.image_topic, ()) if name in _IMAGE_CLASSES]
         if known and self._images is None and not self._refusal:
             try:
                 self._images = self._subscribe(known[0], self._camera.image_topic, self._on_image)
@@ -121,7 +127,7 @@ class _CameraInput:
             self._node.destroy_subscription(subscription)
 
     def _image_troubles(self, types: Mapping[str, Sequence[str]]) -> list[Trouble]:
-        topic = self._image_topic
+        topic = self.image_topic
         if not self._node.count_publishers(topic):
             return [(CameraState.WAITING_FOR_IMAGES, f"no publisher on {topic}")]
         if self._refusal:

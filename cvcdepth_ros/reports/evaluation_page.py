@@ -18,6 +18,7 @@ from cvcdepth_core.visualization import DepthScale
 from cvcdepth_ros.evaluation.image_scores import SetScore, correlations
 from cvcdepth_ros.evaluation.job import EvaluationJob
 from cvcdepth_ros.evaluation.measuring import Remeasuring
+from cvcdepth_ros.evaluation.references import reference_titles
 from cvcdepth_ros.evaluation.result import PROTOCOLS, EvaluationResult
 from cvcdepth_ros.reports import evaluation_figures as figures
 from cvcdepth_ros.reports.evaluation_pictures import GREATEST_ERROR, error_colours
@@ -52,6 +53,7 @@ def render(result: EvaluationResult, shown: Sequence[ShownSet]) -> str:
         "lidar_set": _with_most_tiles(shown),
         "metric_titles": _METRIC_TITLES,
         "label_free_titles": _LABEL_FREE_TITLES,
+        "reference_titles": reference_titles(result.configuration),
         "score_tables": _score_tables(result),
         "groups": _group_titles(result),
         "agreement": summarise_agreement(result.agreement),

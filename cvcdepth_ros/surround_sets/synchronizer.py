@@ -93,6 +93,9 @@ class CameraStatistics:
     clock_steps: int  # how often the stamps stepped back
     period_ns: int | None  # None until two images have come
     missed: int = 0  # sets that left without this camera
+    newest_ns: int | None = None  # latest corrected stamp since the last clock step
+    lacked: int = 0  # anchor images that were passed over for want of an image of this camera
+    gap_ns: int | None = None  # by how much its nearest image was later than the last of these; None: it had none
 
 
 @dataclass(frozen=True)
@@ -194,7 +197,7 @@ class SurroundSynchronizer(Generic[T]):
             if len(chosen) >= self.required:
                 sets.append(self._emit(chosen))
             else:
-                self._pass_over(anchor)
+                self._pass_over(anchor, chosen)
         return sets
 
     def _appoint_anchor(self) -> None:
@@ -261,7 +264,9 @@ class SurroundSynchronizer(Generic[T]):
         self._last_stamp = anchor
         return surround_set
 
-    def _pass_over(self, anchor: int) -> None:
+    def _pass_over(self, anchor: int, chosen: Collection[str]) -> None:
+        for name in self._streams.keys() - chosen:
+            self._streams[name].lack(anchor)
         self._streams[self._acting_anchor].drop_oldest("unmatched")
         for stream in self._streams.values():
             stream.drop_before(anchor - self._tolerance)
@@ -283,7 +288,8 @@ class _Stream(Generic[T]):
         self._arrivals: deque[int] = deque(maxlen=_PATIENCE_PERIODS)  # numbers, counted over all cameras
         self._queue_size = queue_size
         self._clock_jump = clock_jump
-        self._received = self._matched = self._missed = self._clock_steps = 0
+        self._received = self._matched = self._missed = self._lacked = self._clock_steps = 0
+        self._gap: int | None = None
         self._dropped: Counter[str] = Counter()
 
     def accept(self, stamp: int, image: T, arrival: int) -> None:
@@ -339,6 +345,12 @@ class _Stream(Generic[T]):
         self._missed += 1
         self.drop_before(before)
 
+    def lack(self, anchor: int) -> None:
+        """Note that an anchor image is passed over because none of this camera's belongs to it."""
+        self._lacked += 1
+        gaps = [stamp - anchor for stamp in (*self.stamps, *([] if self._floor is None else [self._floor]))]
+        self._gap = min(gaps, key=abs, default=None)
+
     def drop_before(self, stamp: int) -> None:
         while self.stamps and self.stamps[0] < stamp:
             self.drop_oldest("unmatched")
@@ -359,7 +371,16 @@ class _Stream(Generic[T]):
         dropped = {reason: count for reason, count in self._dropped.items() if count}
         queued = len(self.stamps)
         return CameraStatistics(
-            self._received, self._matched, queued, dropped, self._clock_steps, self.period, self._missed
+            received=self._received,
+            matched=self._matched,
+            queued=queued,
+            dropped=dropped,
+            clock_steps=self._clock_steps,
+            period_ns=self.period,
+            missed=self._missed,
+            newest_ns=self.newest,
+            lacked=self._lacked,
+            gap_ns=self._gap,
         )
 
     def _pop_oldest(self) -> T:

@@ -10,7 +10,7 @@ from cvcdepth_core.estimator import SurroundDepthEstimator
 from cvcdepth_core.pointcloud import CloudLimits, merged_cloud
 from cvcdepth_core.rendering.agreement import PosedDepth
 from cvcdepth_core.scoring.consistency import spatial_rows
-from cvcdepth_core.scoring.references import constant_depth, ground_plane_depth
+from cvcdepth_core.scoring.references import best_constant, constant_depth, ground_plane_depth
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.recordings.rig import discover_rig
 
@@ -31,6 +31,15 @@ def test_constant_depth_is_the_same_everywhere(rig):
     depth = estimate(rig, constant_depth(rig, 7.5, 96, 160)).depth
     assert depth.shape == (6, 96, 160)
     assert (depth == 7.5).all()
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 100])
+def test_the_best_constant_has_the_least_relative_error_of_all(count):
+    truth = np.random.default_rng(count).uniform(1.0, 80.0, count)
+    found = best_constant(truth)
+    errors = [np.abs(candidate - truth) @ (1 / truth) for candidate in (found, *np.linspace(0.5, 90.0, 2000))]
+    assert errors[0] <= min(errors) + 1e-12
+    assert np.isnan(best_constant(truth[:0]))
 
 
 def test_every_point_of_the_ground_plane_lies_on_it_unless_it_is_at_the_far_limit(rig):

@@ -23,6 +23,7 @@ from recordings import JAZZY, SAMPLE
 from cvcdepth_core.networks.checkpoint import load_checkpoint
 from cvcdepth_core.training.config import load_training_config
 from cvcdepth_ros.bag_replay import main
+from cvcdepth_ros.evaluation.trained_on import trained_parts
 
 pytestmark = pytest.mark.timeout(600)  # whole runs, in a fixture too: minutes on a machine that does other work
 
@@ -131,11 +132,28 @@ def test_the_scores_are_those_of_evaluate_on_the_held_out_part(better, tmp_path,
     assert main([str(argument) for argument in (*arguments, *window)]) == 0
     metrics = json.loads(capsys.readouterr().out)
     assert metrics["sets"] == 6
+    assert metrics["trained_on"] == []
     cameras = metrics["scores"]["image"]["metric"]["cameras"]
     expected = {name: numbers["all"]["abs_rel"] for name, numbers in cameras.items()}
     found = {name: numbers["abs_rel"] for name, numbers in with_start["scores"]["after"]["cameras"].items()}
     assert found.pop("back") == pytest.approx(expected.pop("back"), rel=1e-4)  # its roof is masked in the run
     assert found == pytest.approx(expected, rel=1e-6)
+
+
+def test_weights_say_what_they_and_their_start_were_trained_on_and_not_what_was_held_out(better, worse):
+    stamps = np.array(front_stamps(), dtype=np.int64)
+    (part,) = trained_parts(load_checkpoint(better.folder / "best.safetensors"))
+    assert (part.recording, part.sets_among(stamps), part.sets_among(stamps[4:])) == (SAMPLE.name, 4, 0)
+    assert trained_parts(load_checkpoint(better.folder / "start.safetensors")) == []
+    inherited, own = trained_parts(load_checkpoint(worse.folder / "last.safetensors"))
+    assert inherited == part
+    assert (own.recording, own.sets_among(stamps)) == ("blind <b>&", 7)
+
+
+def front_stamps() -> list[int]:
+    entries = [e for e in recordings.sample_entries() if e.topic.startswith("/camera/front/image")]
+    headers = [JAZZY.deserialize_cdr(entry.cdr, entry.type).header.stamp for entry in entries]
+    return [stamp.sec * 10**9 + stamp.nanosec for stamp in headers]
 
 
 def test_validations_are_logged_at_the_start_in_between_and_at_the_end(better):

@@ -35,6 +35,7 @@ from cvcdepth_ros.evaluation.image_scores import LabelFree, SetScore
 from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings
 from cvcdepth_ros.evaluation.measuring import RecordingScores, Remeasuring, open_evaluation
 from cvcdepth_ros.evaluation.result import Failure
+from cvcdepth_ros.evaluation.trained_on import TrainedPart, to_metadata
 from cvcdepth_ros.evaluation.workers import evaluate_all
 from cvcdepth_ros.recordings.replay import DepthReplay
 from cvcdepth_ros.reports.shown_sets import chosen_sets
@@ -292,6 +293,101 @@ def test_flat_ground_agrees_with_itself_far_better_than_a_wall_around_every_came
     assert medians[0] < 0.03 < medians[1]
 
 
+def test_without_lidar_the_label_free_scores_of_cameras_and_references_are_printed(
+    two_sets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    result = score(tmp_path, two_sets, *SMALL, "--no-lidar", "--ground-height", "-0.4")
+    printed = table_of(capsys.readouterr().out)
+    assert list(printed) == [*result["recordings"][0]["cameras"], "all", "constant 10 m", "ground at -0.4 m"]
+    found = result["label_free"]
+    for camera, numbers in (*found["cameras"].items(), ("all", found["mean"])):
+        known = [numbers[name] for name in LabelFree._fields]
+        assert printed[camera] == ["-" if number is None else f"{number:.3f}" for number in known]
+    for pair in found["pairs"]:
+        if pair["kind"] == "temporal":  # one for each camera
+            assert found["cameras"][pair["camera"]]["temporal"] == pytest.approx(pair["median"])
+    assert found["mean"]["temporal"] == pytest.approx(np.mean([c["temporal"] for c in found["cameras"].values()]))
+
+
+def table_of(text: str) -> dict[str, list[str]]:
+    """Return the first table's cells by the first one, which may be of several words."""
+    lines = text.splitlines()
+    assert all(len(line) <= 80 for line in lines[: lines.index("")]), text
+    rows = [re.split(r"\s{2,}", line.strip()) for line in lines[1 : lines.index("")]]
+    return {name: cells for name, *cells in rows if cells}
+
+
+@pytest.mark.parametrize("name", ["constant", "ground_plane"])
+def test_a_reference_beside_the_model_scores_as_it_does_alone(
+    name: str, two_sets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    options = ("--ground-height", "-0.4", "--constant-depth", "8")
+    beside = score(tmp_path / "beside", two_sets, *SMALL, *options)
+    printed = table_of(capsys.readouterr().out)["constant 8 m" if name == "constant" else "ground at -0.4 m"]
+    alone = score(tmp_path / "alone", two_sets, "--predictor", name, "--height", "64", "--width", "96", *options)
+    for scaling in ("metric", "median"):
+        expected = alone["scores"]["image"][scaling]["mean"]["all"]
+        assert beside["references"][name]["scores"][scaling] == pytest.approx(expected, rel=1e-9)
+    assert printed[0] == f"{alone['scores']['image']['metric']['mean']['all']['abs_rel']:.3f}"
+
+
+def test_no_constant_is_better_than_the_best_constant_of_each_image(output: Path, two_sets: Path, tmp_path: Path):
+    best = metrics_of(output)["references"]["best_constant"]["scores"]["metric"]["abs_rel"]
+    assert best < metrics_of(output)["scores"]["image"]["metric"]["mean"]["all"]["abs_rel"]
+    assert best <= metrics_of(output)["scores"]["image"]["median"]["mean"]["all"]["abs_rel"]
+
+
+def test_ground_that_is_not_below_the_cameras_is_left_out_with_the_reason(
+    two_sets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    result = score(tmp_path, two_sets, *SMALL, "--ground-height", "5")
+    assert list(result["references"]) == ["constant", "best_constant"]
+    assert "no flat ground to compare with: ground plane: the ground at z = 5.0 m is not" in capsys.readouterr().out
+
+
+# A model that knows what it is scored on
+
+
+def test_the_packages_own_model_says_that_it_was_trained_on_the_sample(
+    two_sets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    result = score(tmp_path, two_sets, report=True)
+    expected = {"recording": "two_sets", "trained_as": "pandaset_002", "sets": 2, "scored": 2}
+    assert result["trained_on"] == [expected]
+    assert "two_sets: the model was trained on 2 of these 2 sets (pandaset_002)" in capsys.readouterr().out
+    assert "trained on 2 of the 2 sets of two_sets" in (tmp_path / "report.html").read_text()
+
+
+def test_a_checkpoint_that_was_trained_elsewhere_or_does_not_say_is_not_accused(
+    two_sets: Path, checkpoints: list[Path], tmp_path: Path
+):
+    assert score(tmp_path / "silent", two_sets, "--checkpoint", checkpoints[0])["trained_on"] == []
+    elsewhere = TrainedPart.from_stamps("other", np.arange(1557539960 * 10**9, 1557539962 * 10**9, 10**8 + 7))
+    assert score(tmp_path / "other", two_sets, "--checkpoint", told(tmp_path, elsewhere))["trained_on"] == []
+
+
+def test_sets_after_the_trained_part_are_not_counted(tmp_path: Path):
+    stamps = np.array([m["stamp_ns"] for m in stamps_of_sample()], dtype=np.int64)
+    trained = TrainedPart.from_stamps("monday", stamps[:4])
+    result = score(tmp_path / "scores", SAMPLE, "--checkpoint", told(tmp_path, trained))
+    assert [(seen["sets"], seen["scored"], seen["trained_as"]) for seen in result["trained_on"]] == [(4, 10, "monday")]
+
+
+def stamps_of_sample() -> list[dict[str, int]]:
+    job = EvaluationJob("sample", str(SAMPLE), EvaluationSettings(predictor="constant", height=64, width=96), lidar=())
+    with open_evaluation(job) as evaluation:
+        return [{"stamp_ns": measured.stamp_ns} for measured in evaluation.sets(*evaluation.window)]
+
+
+def told(folder: Path, part: TrainedPart) -> Path:
+    """Return a checkpoint that says that it was trained on the part."""
+    spec = DepthModelSpec(encoder="efficientnet_lite0", height=64, width=96, min_depth=1.0, max_depth=50.0)
+    torch.manual_seed(1)
+    path = folder / "told.safetensors"
+    save_checkpoint(path, spec, DepthNet(spec.encoder).state_dict(), metadata=to_metadata([part]))
+    return path
+
+
 def test_a_set_without_truth_is_not_shown_as_the_best_beside_sets_that_have_it():
     sets = [SetScore("drive", number, 0, error, LabelFree(0.05)) for number, error in enumerate((0.3, math.nan, 0.2))]
     assert [(title, found.number) for title, found in chosen_sets(sets)] == [("Median set", 2), ("Worst set", 0)]
@@ -304,6 +400,7 @@ def test_a_set_without_truth_is_not_shown_as_the_best_beside_sets_that_have_it()
 DOCUMENTATION = (ROOT / "docs" / "evaluation.md").read_text(encoding="utf-8")
 NAMES_VARY = re.compile(
     r"scores(\.\*)?|scale_ratio(\.\*)?|scores\.\*\.\*\.(mean|cameras)(\.\*)*|label_free\.rank_correlation_with_abs_rel"
+    r"|label_free\.(mean|cameras(\.\*)?)|references(\.\*\.(scores(\.\*)?|label_free))?"
 )
 
 
@@ -430,6 +527,23 @@ def test_two_workers_give_exactly_the_files_of_one(drives: Path, in_turn: Path, 
     score(tmp_path, drives, *SMALL, "--workers", "2", report=True)
     for name in ("metrics.json", "per_frame.csv", "report.html"):
         assert (tmp_path / name).read_bytes() == (in_turn / name).read_bytes()
+
+
+def test_every_recording_has_a_line_and_every_rig_a_number(
+    two_sets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    entries = [entry for entry in recordings.entries_of(two_sets) if "/camera/left/" not in entry.topic]
+    drives = tmp_path / "drives"
+    shutil.copytree(two_sets, drives / "monday")
+    shutil.copytree(two_sets, drives / "tuesday")
+    recordings.write_rosbag2(drives / ("a_van_without_its_left_camera" * 3), entries)
+    score(tmp_path / "scores", drives, *CONSTANT)
+    lines = capsys.readouterr().out.splitlines()
+    first = next(i for i, line in enumerate(lines) if line.startswith("recording "))
+    names = [re.split(r"\s{2,}", line)[0] for line in lines[first + 1 : first + 4]]
+    assert names == ["1: a_van_w…ft_camera", "2: monday", "2: tuesday"]
+    assert lines[first + 5] == "rig 2: front, front_left, left, back, right, front_right"
+    assert all(len(line) <= 80 for line in lines if re.search(r"\d\.\d{3} ", line))
 
 
 def test_a_recording_that_fails_is_named_and_stops_no_other(drives: Path, in_turn: Path):

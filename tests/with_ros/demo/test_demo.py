@@ -286,7 +286,7 @@ def diagnostics(published: int, matched: int = 10, replaced: int = 0) -> Any:
 
     from cvcdepth_ros.live.camera_states import CameraCondition, CameraState, CameraWatch
     from cvcdepth_ros.live.mailbox import MailboxStatistics
-    from cvcdepth_ros.node.diagnostics import OK, SynchronisationStatus, camera_status, inference_status, status
+    from cvcdepth_ros.node.diagnostics import OK, camera_status, inference_status, status, synchronisation_status
     from cvcdepth_ros.surround_sets.latencies import StageLatencies
     from cvcdepth_ros.surround_sets.synchronizer import CameraStatistics, SynchronizerStatistics
 
@@ -305,7 +305,7 @@ def diagnostics(published: int, matched: int = 10, replaced: int = 0) -> Any:
             camera_status(name, CameraCondition(CameraState.OK), values, CameraWatch(1.0, 1.0), lost=3)
             for name, values in cameras.items()
         ),
-        SynchronisationStatus(0.5).status(SynchronizerStatistics(matched, cameras), mailbox, counters),
+        synchronisation_status(SynchronizerStatistics(matched, cameras), mailbox, counters),
         inference_status(latencies.summaries(), mailbox, "", "a model"),
     ]
     for entry in statuses:

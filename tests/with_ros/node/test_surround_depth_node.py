@@ -424,7 +424,7 @@ def test_qos_overrides_make_a_single_topic_match(graph, messages, rig_content, t
 @pytest.mark.parametrize(
     ("parameters", "reason"),
     [
-        ({"untrained": True}, "parameter rig is empty"),
+        ({"untrained": True, "rig": "''"}, "parameter rig is empty"),
         ({"rig": "RIG", "untrained": True, "checkpoint": "model.safetensors"}, "a checkpoint is trained; name none"),
         ({"rig": "/nowhere/rig.yaml", "untrained": True}, "rig file /nowhere/rig.yaml: cannot be read"),
         ({"rig": "RIG", "checkpoint": "/nowhere/model.safetensors"}, "/nowhere/model.safetensors: no such file"),
@@ -557,7 +557,7 @@ def test_the_parameter_file_lists_every_parameter_with_its_default(graph):
 
     content = yaml.safe_load((ROOT / "config" / "surround_depth.yaml").read_text())["/**"]["ros__parameters"]
     defaults = {name: field.default for name, field in NodeParameters.model_fields.items()}
-    assert content == defaults | {"rig": "auto"}
+    assert content == defaults
     graph.start_node("--params-file", str(ROOT / "config" / "surround_depth.yaml"), "-p", "untrained:=true")
     graph.spin_until(lambda: "node" in str(graph.statuses), "diagnostics")
     assert "rig auto" in message_of(graph, "node") or "tf2_msgs" in message_of(graph, "node")
