@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from cvcdepth_core.errors import CvcDepthError, NotPromotedError
-from cvcdepth_ros.commands import bench, check, evaluate, export, finetune, inspect, play, rig, run
+from cvcdepth_ros.commands import bench, check, evaluate, export, finetune, inspect, play, rig, run, simulate
 from cvcdepth_ros.version import package_version
 
 
@@ -38,6 +38,7 @@ COMMANDS: Mapping[str, Command] = {
     "play": play,
     "bench": bench,
     "export": export,
+    "simulate": simulate,
 }
 
 

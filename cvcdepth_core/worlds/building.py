@@ -4,15 +4,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
+from cvcdepth_core.rig.poses import Pose
 from cvcdepth_core.worlds.barriers import build_barriers, build_wires
 from cvcdepth_core.worlds.buildings import build_buildings
 from cvcdepth_core.worlds.description import Sky, Weather, WorldSpec
 from cvcdepth_core.worlds.furniture import LAMP_ARM, build_furniture, furniture_height
 from cvcdepth_core.worlds.ground import build_ground, build_patches
 from cvcdepth_core.worlds.light import Lamps, Light, sun_direction, sunlight
+from cvcdepth_core.worlds.meshes import Mesh
+from cvcdepth_core.worlds.own_body import BodyKind, own_body
 from cvcdepth_core.worlds.people import build_people, person_mesh
 from cvcdepth_core.worlds.roads import build_roads
 from cvcdepth_core.worlds.site import Site
@@ -32,8 +37,20 @@ _SKY_LIGHT: dict[Weather, tuple[tuple[float, float, float], tuple[float, float, 
 _LAMP_COLOUR, _LAMP_HEAD = np.array([1.0, 0.78, 0.5]), 0.9
 
 
-def build_world(spec: WorldSpec) -> tuple[World, Trajectory]:
-    """Build the world, and the way of the vehicle that carries the sensors."""
+class Built(NamedTuple):
+    """A world and the vehicle that drives through it."""
+
+    world: World
+    way: Trajectory
+    """Of the vehicle's base frame, which is on the ground."""
+    body: Mesh | None
+    """Of that vehicle, in its base frame."""
+
+
+def build_world(
+    spec: WorldSpec, body: BodyKind = "none", base_T_cameras: Sequence[Pose] = (), body_seed: int = 0
+) -> Built:
+    """Build a world, and the vehicle's body so that the cameras are outside of it."""
     site = Site(spec)
     build_ground(site)
     build_roads(site)
@@ -42,11 +59,12 @@ def build_world(spec: WorldSpec) -> tuple[World, Trajectory]:
         build(site)
     build_vehicles(site)
     build_people(site)
-    movers = tuple([*_moving_vehicles(site), *_moving_people(site)])
+    movers = (*_moving_vehicles(site), *_moving_people(site))
+    own = own_body(site, body, base_T_cameras, body_seed)
     mesh, objects = site.mesh()
     light = build_light(spec.sky, _lamps(site))
     world = World(mesh, objects, tuple(site.names), movers, site.table.array(), light)
-    return world, vehicle_trajectory(site, spec.drive, spec.drive)
+    return Built(world, vehicle_trajectory(site, spec.drive, spec.drive), own)
 
 
 def build_light(sky: Sky, lamps: Lamps) -> Light:

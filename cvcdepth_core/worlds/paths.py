@@ -45,7 +45,8 @@ class Path:
 
     def curvature(self, s: Floats | float) -> Floats:
         """1/m at s, positive to the left; 0 beyond the ends."""
-        return np.where(self._inside(s), self._curvature[self._sample(s)[0]], 0.0)
+        middles = (np.arange(len(self._curvature)) + 0.5) * _STEP
+        return np.where(self._inside(s), np.interp(s, middles, self._curvature), 0.0)
 
     def points(self, s: Floats | float, l: Floats | float = 0.0) -> Floats:  # noqa: E741
         """x, y [..., 2] at s along the curve and l to its left."""

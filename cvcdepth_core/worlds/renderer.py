@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +15,10 @@ from cvcdepth_core.worlds.meshes import Floats, Mesh
 from cvcdepth_core.worlds.openness import openness
 from cvcdepth_core.worlds.scene import Rays, Scene
 from cvcdepth_core.worlds.shading import shade
-from cvcdepth_core.worlds.world import SKY, World
+from cvcdepth_core.worlds.world import SKY, Way, World
 
 _NEAR = 0.02  # metres: nothing is seen closer to the lens
+_BAND = 16  # rows of a rolling shutter that are drawn at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,55 +47,100 @@ class View:
 class Renderer:
     """Draws one world as seen by the cameras of one vehicle."""
 
-    def __init__(self, world: World, vehicle: Mesh | None = None, samples: int = 2) -> None:
-        """`vehicle` is its body in its base frame; each pixel's colour is the mean of `samples` x `samples` rays."""
-        self.scene = Scene(world, vehicle)
+    def __init__(self, world: World, way: Way, body: Mesh | None = None, samples: int = 2) -> None:
+        """`way` is that of the vehicle's base frame, `body` its body in that frame.
+
+        Each pixel's colour is the mean of `samples` x `samples` rays.
+        """
+        self.scene = Scene(world, body)
+        self._way = way
         self._samples = samples
 
-    def view(self, lens: Lens, base_T_camera: Pose, world_T_base: Pose, time: float, speed: float = 0.0) -> View:
-        """Take a picture at a time (seconds); `speed` of the vehicle tells whether its own body moves."""
-        self.scene.set_moment(time, world_T_base, speed)
-        world_T_camera = world_T_base @ base_T_camera
-        truth, open_share = self._truth(lens, world_T_camera)
-        return View(self._light(lens, world_T_camera, open_share), truth)
+    def view(self, lens: Lens, base_T_camera: Pose, time: float, readout: float = 0.0) -> View:
+        """Take a picture at a time, seconds.
 
-    def truth(self, lens: Lens, base_T_camera: Pose, world_T_base: Pose, time: float, speed: float = 0.0) -> Truth:
-        """The truth of `view` alone."""
-        self.scene.set_moment(time, world_T_base, speed)
-        return self._truth(lens, world_T_base @ base_T_camera)[0]
+        With a `readout` (seconds from the first row to the last) each row sees the world at its own time, the middle
+        one at `time`; what moves by itself is then moved on every few rows.
+        """
+        parts = []
+        for band in _bands(lens.height, time, readout):
+            truth, opened = self._truth(lens, base_T_camera, band)
+            parts.append(View(self._light(lens, base_T_camera, band, opened), truth))
+        return View(np.concatenate([part.light for part in parts]), _stacked([part.truth for part in parts]))
 
-    def _truth(self, lens: Lens, world_T_camera: Pose) -> tuple[Truth, Floats]:
+    def truth(self, lens: Lens, base_T_camera: Pose, time: float, readout: float = 0.0) -> Truth:
+        """Return the truth of `view` alone."""
+        bands = _bands(lens.height, time, readout)
+        return _stacked([self._truth(lens, base_T_camera, band)[0] for band in bands])
+
+    def _truth(self, lens: Lens, base_T_camera: Pose, band: _Band) -> tuple[Truth, Floats]:
         """Return also how open each pixel's place is to the sky, [H, W]."""
-        camera_rays = lens.centre_rays.reshape(3, -1)
-        rays = _rays(camera_rays, world_T_camera)
+        self.scene.set_moment(band.middle, self._way.pose(band.middle), self._way.speed(band.middle))
+        camera_rays = lens.centre_rays[:, band.rows]
+        rays = _rays(camera_rays, self._way.poses(band.times) @ base_T_camera)
         hits = self.scene.nearest(rays)
         distances = self.scene.exact_distances(rays, hits)
         faces, hit = np.maximum(hits.faces, 0), hits.faces >= 0
         normals = self.scene.faces.plane.take(faces, axis=0)[:, :3]
         away = np.einsum("ni,ni->n", normals, rays.directions) > 0
         normals = np.where(away[:, None], -normals, normals) * hit[:, None]
-        shape = (lens.height, lens.width)
+        shape = camera_rays.shape[1:]
         truth = Truth(
-            ((distances + _NEAR) * camera_rays[2]).reshape(shape),
+            (distances + _NEAR).reshape(shape) * camera_rays[2],
             np.where(hit, self.scene.faces.objects[faces], SKY).reshape(shape).astype(np.int32),
             (hit & self.scene.faces.moving[faces]).reshape(shape),
             normals.reshape(*shape, 3).astype(np.float32),
         )
         return truth, openness(self.scene, rays, distances, truth)
 
-    def _light(self, lens: Lens, world_T_camera: Pose, open_share: Floats) -> NDArray[np.float32]:
+    def _light(self, lens: Lens, base_T_camera: Pose, band: _Band, opened: Floats) -> NDArray[np.float32]:
         n = self._samples
-        rays = _rays(lens.rays(n).reshape(3, -1), world_T_camera)
-        spread = np.repeat(np.repeat(lens.pixel_angles / n, n, axis=0), n, axis=1).reshape(-1).astype(np.float32)
-        opened = np.repeat(np.repeat(open_share, n, axis=0), n, axis=1).reshape(-1)
-        light = shade(self.scene, rays, spread, opened, lens.width * n)
-        averaged = light.reshape(3, lens.height, n, lens.width, n).mean(axis=(2, 4))
+        rows = slice(band.rows.start * n, band.rows.stop * n)
+        poses = np.repeat(self._way.poses(band.times) @ base_T_camera, n if len(band.times) > 1 else 1, axis=0)
+        rays = _rays(lens.rays(n)[:, rows], poses)
+        spread = _finer(lens.pixel_angles[band.rows] / n, n).astype(np.float32)
+        light = shade(self.scene, rays, spread, _finer(opened, n), lens.width * n)
+        averaged = light.reshape(3, len(opened), n, lens.width, n).mean(axis=(2, 4))
         return np.ascontiguousarray(np.moveaxis(averaged, 0, -1), np.float32)
 
 
-def _rays(camera_rays: Floats, world_T_camera: Pose) -> Rays:
-    """Rays of the world [N, 3] from unit vectors [3, N] of the camera; they start a little before the lens."""
+class _Band(NamedTuple):
+    """Rows that are drawn at once."""
+
+    rows: slice
+    times: Floats
+    """Of each row, or one for all."""
+    middle: float
+    """When what moves by itself is where it is drawn."""
+
+
+def _bands(height: int, time: float, readout: float) -> list[_Band]:
+    if not readout:
+        return [_Band(slice(0, height), np.array([time]), time)]
+    times = time + ((np.arange(height) + 0.5) / height - 0.5) * readout
+    starts = range(0, height, _BAND)
+    bands = (slice(start, min(start + _BAND, height)) for start in starts)
+    return [_Band(rows, times[rows], float(times[rows].mean())) for rows in bands]
+
+
+def _stacked(parts: list[Truth]) -> Truth:
+    names = ("depth", "objects", "moving", "normals")
+    return Truth(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+def _finer(values: Floats, n: int) -> Floats:
+    """Repeat each pixel's value [H, W] for its rays, flat."""
+    return np.repeat(np.repeat(values, n, axis=0), n, axis=1).reshape(-1)
+
+
+def _rays(camera_rays: Floats, world_T_camera: Floats) -> Rays:
+    """Return rays of the world from unit vectors [3, H, W] of a camera; they start a little before the lens.
+
+    `world_T_camera` is [H, 4, 4] or [1, 4, 4].
+    """
     x, y, z = camera_rays
-    R = world_T_camera[:3, :3]
-    directions = np.stack([R[i, 0] * x + R[i, 1] * y + R[i, 2] * z for i in range(3)], axis=1)
-    return Rays(world_T_camera[:3, 3] + _NEAR * directions, directions)
+    R = world_T_camera[:, None, :3, :3]
+    ways = [R[..., i, 0] * x + R[..., i, 1] * y + R[..., i, 2] * z for i in range(3)]
+    directions = np.stack(ways, axis=-1)
+    origins = world_T_camera[:, None, :3, 3] + _NEAR * directions
+    return Rays(origins.reshape(-1, 3), directions.reshape(-1, 3))

@@ -18,7 +18,7 @@ from cvcdepth_core.worlds.site import Site
 _PITCH_PER_ACCELERATION = 0.006  # radians per m/s^2: a sprung body
 _ROLL_PER_ACCELERATION = 0.005
 _SMOOTHING = 0.35  # seconds to either side over which a body feels a change of speed
-_BUMPS = ((1.7, 0.0022), (4.3, 0.004), (11.0, 0.006))  # wavelength and height, metres, of what wheels run over
+_BUMPS = ((3.1, 0.002), (7.3, 0.004), (17.0, 0.008))  # wavelength and height, metres, of what wheels run over
 
 
 class SpeedProfile:
@@ -29,21 +29,21 @@ class SpeedProfile:
         self._speeds = np.array([speed for _, speed in speeds], np.float64)
         steps = np.diff(self._times) * (self._speeds[1:] + self._speeds[:-1]) / 2
         self._distances = np.r_[0.0, np.cumsum(steps)]
-        self._start = 0.0
+        self._start: Floats = np.zeros(())
         self._start = self.distance(0.0)
 
-    def speed(self, time: float) -> float:
-        """Metres per second."""
-        return float(np.interp(time, self._times, self._speeds))
+    def speed(self, time: Floats | float) -> Floats:
+        """Metres per second at each time."""
+        return np.interp(time, self._times, self._speeds)
 
-    def distance(self, time: float) -> float:
-        """Metres covered since time 0."""
-        i = int(np.clip(np.searchsorted(self._times, time, side="right") - 1, 0, len(self._times) - 1))
-        since, first = time - self._times[i], self._speeds[i]
-        return float(self._distances[i] + since * (first + self.speed(time)) / 2) - self._start
+    def distance(self, time: Floats | float) -> Floats:
+        """Metres covered since time 0 until each time."""
+        i = np.clip(np.searchsorted(self._times, time, side="right") - 1, 0, len(self._times) - 1)
+        since = time - self._times[i]
+        return self._distances[i] + since * (self._speeds[i] + self.speed(time)) / 2 - self._start
 
-    def acceleration(self, time: float) -> float:
-        """Mean over a short while around a time, m/s^2."""
+    def acceleration(self, time: Floats | float) -> Floats:
+        """Mean over a short while around each time, m/s^2."""
         return (self.speed(time + _SMOOTHING) - self.speed(time - _SMOOTHING)) / (2 * _SMOOTHING)
 
 
@@ -64,43 +64,49 @@ class Trajectory:
 
     def speed(self, time: float) -> float:
         """Metres per second, negative backwards."""
-        return self.profile.speed(time)
+        return float(self.profile.speed(time))
 
     def pose(self, time: float) -> Pose:
-        """world_T_body [4, 4] at a time in seconds; the body's origin is on the ground, x forward."""
-        s = self.start + self.profile.distance(time)
-        x, y = self.path.points(s).tolist()
-        heading = float(self.path.heading(s))
-        rear_front, right_left, z = self._slopes(x, y, heading)
-        pitch, roll, lift = (0.0, 0.0, 0.0)
-        if self.sprung:
-            pitch, roll, lift = self._body_motion(s, time)
-        forward = np.array([math.cos(heading), math.sin(heading), rear_front - pitch])
-        leftward = np.array([-math.sin(heading), math.cos(heading), right_left + roll])
-        forward /= np.linalg.norm(forward)
-        leftward -= forward * (forward @ leftward)
-        leftward /= np.linalg.norm(leftward)
-        pose = np.eye(4)
-        pose[:3, :3] = np.stack([forward, leftward, np.cross(forward, leftward)], axis=1)
-        pose[:3, 3] = x, y, z + lift
+        """Return world_T_body [4, 4] at a time in seconds; the body's origin is on the ground, x forward."""
+        pose: Pose = self.poses(np.array([time]))[0]
         return pose
 
-    def _slopes(self, x: float, y: float, heading: float) -> tuple[float, float, float]:
+    def poses(self, times: Floats) -> Floats:
+        """Return world_T_body [T, 4, 4] at all times [T]."""
+        s = self.start + self.profile.distance(times)
+        xy, heading = self.path.points(s), self.path.heading(s)
+        ahead, aside, z = self._slopes(xy, heading)
+        if self.sprung:
+            pitch, roll, lift = self._body_motion(s, times)
+            ahead, aside, z = ahead - pitch, aside + roll, z + lift
+        forward = _unit(np.stack([np.cos(heading), np.sin(heading), ahead], axis=-1))
+        left = np.stack([-np.sin(heading), np.cos(heading), aside], axis=-1)
+        left = _unit(left - forward * (forward * left).sum(axis=-1, keepdims=True))
+        poses = np.tile(np.eye(4), (len(times), 1, 1))
+        poses[:, :3, :3] = np.stack([forward, left, np.cross(forward, left)], axis=-1)
+        poses[:, :3, 3] = np.c_[xy, z]
+        return poses
+
+    def _slopes(self, xy: Floats, heading: Floats) -> tuple[Floats, Floats, Floats]:
         """Slope forward and to the left, and the height, by the places of four wheels."""
-        c, s = math.cos(heading), math.sin(heading)
+        forward = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+        left = np.stack([-np.sin(heading), np.cos(heading)], axis=-1)
         half, side = self.wheelbase / 2, self.track / 2
-        corners = np.array([(half, side), (half, -side), (-half, side), (-half, -side)])
-        places = np.array([x, y]) + corners @ np.array([[c, s], [-s, c]])
-        fl, fr, rl, rr = self.height(places).tolist()
+        wheels = [xy + a * half * forward + b * side * left for a, b in ((1, 1), (1, -1), (-1, 1), (-1, -1))]
+        fl, fr, rl, rr = self.height(np.concatenate(wheels)).reshape(4, -1)
         return (fl + fr - rl - rr) / (4 * half), (fl + rl - fr - rr) / (4 * side), (fl + fr + rl + rr) / 4
 
-    def _body_motion(self, s: float, time: float) -> tuple[float, float, float]:
+    def _body_motion(self, s: Floats, times: Floats) -> tuple[Floats, Floats, Floats]:
         """Nose-down angle, angle to the right and lift of a sprung body."""
-        speed = self.profile.speed(time)
-        pitch = -_PITCH_PER_ACCELERATION * self.profile.acceleration(time)
-        roll = _ROLL_PER_ACCELERATION * speed * speed * float(self.path.curvature(s))
-        front, rear = (sum(h * math.sin(2 * math.pi * (s + d) / w) for w, h in _BUMPS) for d in (1.35, -1.35))
+        pitch = -_PITCH_PER_ACCELERATION * self.profile.acceleration(times)
+        roll = _ROLL_PER_ACCELERATION * self.profile.speed(times) ** 2 * self.path.curvature(s)
+        front, rear = (sum(h * np.sin(2 * math.pi * (s + d) / w) for w, h in _BUMPS) for d in (1.35, -1.35))
         return pitch - 0.4 * (front - rear) / 2.7, roll, (front + rear) / 4
+
+
+def _unit(vectors: Floats) -> Floats:
+    unit: Floats = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return unit
 
 
 def vehicle_trajectory(site: Site, placed: Placed, motion: Motion | Drive, length: float = 4.5) -> Trajectory:

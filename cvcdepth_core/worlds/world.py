@@ -20,6 +20,9 @@ class Way(Protocol):
     def pose(self, time: float) -> Pose:
         """Return world_T_object [4, 4] at a time, seconds from the beginning."""
 
+    def poses(self, times: Floats) -> Floats:
+        """Return world_T_object [T, 4, 4] at times [T]."""
+
     def speed(self, time: float) -> float:
         """Metres per second, negative backwards."""
 

@@ -14,8 +14,8 @@ COMPRESSED_IMAGE_TYPE = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 
 _INFO_SUFFIX = "/camera_info"
-# Image-transport plugins other than `compressed`, and depth images, are not camera pictures.
-_NOT_PICTURES = ("depth", "compressedDepth", "theora", "zstd")
+# Image-transport plugins other than `compressed`, depth images, and what `simulate` knows, are not camera pictures.
+_NOT_PICTURES = ("depth", "compressedDepth", "theora", "zstd", "truth")
 
 
 def discover_cameras(topic_types: Mapping[str, str]) -> list[CameraEntry]:
