@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rendered worlds: descriptions, geometry, materials, light, cameras, LiDAR and motion with exact truth. No ROS formats."""
+"""Rendered worlds with exact truth: descriptions, geometry, materials, light, sensors, motion. No ROS formats."""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator
 
@@ -51,12 +52,12 @@ def _barrier(site: Site, barrier: Barrier) -> Iterator[Mesh]:
 def _pieces(site: Site, barrier: Barrier) -> Iterator[tuple[Floats, Floats]]:
     """Both ends [3] of each straight piece, on the ground."""
     corners = np.array(barrier.line)
-    for first, last in zip(corners[:-1], corners[1:], strict=True):
+    for first, last in itertools.pairwise(corners):
         count = max(1, math.ceil(float(np.hypot(*(last - first))) / _PIECE))
         along = first + (last - first) * np.linspace(0, 1, count + 1)[:, None]
         xy = np.array([site.xy((float(a), float(b)), barrier.road) for a, b in along])
         ends = np.c_[xy, site.terrain.height(xy) + site.raised(xy)]
-        yield from zip(ends[:-1], ends[1:], strict=True)
+        yield from itertools.pairwise(ends)
 
 
 _Piece = Callable[[float, float, int, int, np.random.Generator], Iterator[Mesh]]
@@ -90,14 +91,21 @@ def _mesh(length: float, height: float, material: int, second: int, _: np.random
     """Wire netting between posts."""
     yield box(0.06, 0.06, height + 0.4, second, -0.3).moved(-length / 2)
     yield box(length, 0.03, 0.03, second, height)
-    for x in np.arange(-length / 2, length / 2, 0.2):
-        yield flat_mesh([(x, 0, 0.05), (x + 0.008, 0, 0.05), (x + 0.008, 0, height), (x, 0, height)], [(0, 1, 2), (0, 2, 3)], material)  # fmt: skip
+    wire, half = 0.008, length / 2
+    for x in np.arange(-half, half, 0.2):
+        yield _upright(x, x + wire, 0.05, height, material)
     for z in np.arange(0.15, height, 0.2):
-        yield flat_mesh([(-length / 2, 0, z), (length / 2, 0, z), (length / 2, 0, z + 0.008), (-length / 2, 0, z + 0.008)], [(0, 1, 2), (0, 2, 3)], material)  # fmt: skip
+        yield _upright(-half, half, z, z + wire, material)
+
+
+def _upright(left: float, right: float, bottom: float, top: float, material: int) -> Mesh:
+    """Return a rectangle in the plane y = 0."""
+    corners = [(left, 0, bottom), (right, 0, bottom), (right, 0, top), (left, 0, top)]
+    return flat_mesh(corners, [(0, 1, 2), (0, 2, 3)], material)
 
 
 def _hedge(length: float, height: float, material: int, _: int, rng: np.random.Generator) -> Iterator[Mesh]:
-    """A trimmed body with leaves that stick out of it."""
+    """Return A trimmed body with leaves that stick out of it."""
     depth = min(0.9, 0.35 + 0.3 * height)
     yield box(length + 0.06, 0.8 * depth, 0.95 * height, material, -0.1, (1.0, 0.85))
     count = int(70 * length * height / 2.5) + 30
@@ -147,7 +155,7 @@ def _wires(site: Site, wires: Wires) -> Iterator[Mesh]:
     tops = [(*site.xy(at, wires.road), 0.0) for at in wires.line]
     tops = [(x, y, site.height_on(x, y) + wires.height) for x, y, _ in tops]
     t = np.linspace(0.0, 1.0, 13)[:, None]
-    for first, last in zip(tops[:-1], tops[1:], strict=True):
+    for first, last in itertools.pairwise(tops):
         a, b = np.array(first), np.array(last)
         across = np.array([-(b - a)[1], (b - a)[0], 0.0]) / max(float(np.hypot(*(b - a)[:2])), 0.1)
         for i in range(wires.count):

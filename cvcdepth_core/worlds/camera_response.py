@@ -27,7 +27,9 @@ def develop(light: Floats, look: CameraLook, daylight: float, seed: tuple[int, .
     exposed *= np.array(look.white_balance, np.float32)
     exposed *= _lens_shade(light.shape[0], light.shape[1], look.vignetting, look.dirt, seed[0])[..., None]
     if look.bloom:
-        exposed += np.float32(look.bloom) * cv2.GaussianBlur(np.clip(exposed - 1.0, 0.0, 8.0), (0, 0), light.shape[1] / 50)
+        exposed += np.float32(look.bloom) * cv2.GaussianBlur(
+            np.clip(exposed - 1.0, 0.0, 8.0), (0, 0), light.shape[1] / 50
+        )
     if look.blur > 0.2:
         exposed = cv2.GaussianBlur(exposed, (0, 0), look.blur)
     if look.noise:
@@ -64,7 +66,7 @@ def _lens_shade(height: int, width: int, vignetting: float, dirt: float, seed: i
     rng = np.random.default_rng([seed, 41])
     for _ in range(int(12 * dirt)):
         u, v, size = rng.uniform(-1, 1), rng.uniform(-0.6, 0.6), rng.uniform(0.02, 0.12)
-        shade *= 1.0 - rng.uniform(0.1, 0.5) * np.exp(-(((dx - u) ** 2 + (dy - v) ** 2) / size**2) ** 2)
+        shade *= 1.0 - rng.uniform(0.1, 0.5) * np.exp(-((((dx - u) ** 2 + (dy - v) ** 2) / size**2) ** 2))
     through: Floats = np.clip(shade, 0.05, 1.0).astype(np.float32)
     return through
 

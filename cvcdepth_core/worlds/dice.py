@@ -52,23 +52,23 @@ class Dice:
         self._rng = np.random.default_rng(list(seed))
 
     def between(self, low: float, high: float, digits: int = 2) -> float:
-        """A number between two, evenly; rounded, so that descriptions stay short."""
+        """Return A number between two, evenly; rounded, so that descriptions stay short."""
         return round(float(self._rng.uniform(low, high)), digits)
 
     def scale(self, low: float, high: float, digits: int = 3) -> float:
-        """A number between two, as often in each octave."""
+        """Return A number between two, as often in each octave."""
         return round(float(np.exp(self._rng.uniform(math.log(low), math.log(high)))), digits)
 
     def normal(self, deviation: float, digits: int = 2) -> float:
-        """A number around 0."""
+        """Return A number around 0."""
         return round(float(self._rng.normal(0.0, deviation)), digits)
 
     def chance(self, probability: float) -> bool:
-        """True so often."""
+        """Return True so often."""
         return bool(self._rng.random() < probability)
 
     def whole(self, low: int, high: int) -> int:
-        """A whole number, both ends included."""
+        """Return A whole number, both ends included."""
         return int(self._rng.integers(low, high + 1))
 
     def pick(self, *choices: T) -> T:
@@ -82,11 +82,11 @@ class Dice:
         return keys[int(self._rng.choice(len(keys), p=shares / shares.sum()))]
 
     def seed(self) -> int:
-        """A seed for something's details."""
+        """Return A seed for something's details."""
         return int(self._rng.integers(10_000))
 
     def natural(self, kind: str, spread: float = 0.35) -> Colour:
-        """The colour of such a thing, lighter or darker, and now and then quite another."""
+        """Return the colour of such a thing, lighter or darker, and now and then quite another."""
         if self.chance(0.04):
             return self.any_colour()
         factor = np.exp(self._rng.normal(0.0, spread)) * np.exp(self._rng.normal(0.0, 0.045, 3))

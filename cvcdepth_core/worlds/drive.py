@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A drive through a world with everything that its sensors see, set by set, always the same for the same description."""
+"""A drive through a world with all that its sensors see, set by set; the same for the same description."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from cvcdepth_core.worlds.description import Colour, Furniture, FurnitureKind
 from cvcdepth_core.worlds.materials import Material
-from cvcdepth_core.worlds.meshes import Mesh, box, cylinder, flat_mesh, joined, prism, sphere, sphere_vertices, tube
+from cvcdepth_core.worlds.meshes import Mesh, box, cylinder, joined, prism, sphere, sphere_vertices, tube
 from cvcdepth_core.worlds.palette import (
     corrugated,
     darker,
@@ -45,7 +45,7 @@ def build_furniture(site: Site) -> None:
 
 
 def furniture_height(item: Furniture) -> float:
-    """The height that is given, else the usual one."""
+    """Return the height that is given, else the usual one."""
     return item.height or _HEIGHTS[item.kind]
 
 
@@ -63,7 +63,7 @@ class _Make:
         return self._site.material(material)
 
     def bright(self) -> Colour:
-        """A strong colour."""
+        """Return A strong colour."""
         choices = ((0.55, 0.03, 0.03), (0.02, 0.09, 0.4), (0.03, 0.3, 0.09), (0.6, 0.42, 0.02), (0.6, 0.6, 0.58))
         return choices[int(self.rng.integers(len(choices)))]
 
@@ -109,7 +109,7 @@ def _sign(m: _Make) -> Iterator[Mesh]:
 
 
 def _plate(corners: int, radius: float, face: int, back: int) -> Mesh:
-    """A thin regular polygon that faces -x."""
+    """Return A thin regular polygon that faces -x."""
     angles = np.linspace(0, 2 * math.pi, corners, endpoint=False) + math.pi / 2
     outline = [(radius * math.cos(a), radius * math.sin(a)) for a in angles]
     upright = prism(outline, 0.0, 0.02, back, cap=face)

@@ -24,7 +24,7 @@ class Layout:
         self._taken = np.zeros((0, 6))  # x, y, cosine, sine, half length, half width
 
     def span(self, road: int = 0) -> tuple[float, float]:
-        """The part of a road, s from and to, that the drive can see well."""
+        """Return the part of a road, s from and to, that the drive can see well."""
         length = self.corridors[road].path.length
         if road:
             return 15.0, length - 15.0

@@ -31,7 +31,7 @@ class Lens:
         """Unit vectors [3, H, W] float64 through the pixels' centres."""
 
     def rays(self, samples: int) -> Floats:
-        """Unit vectors [3, H samples, W samples] float64: `samples` x `samples` of them through each pixel."""
+        """Return unit vectors [3, H samples, W samples] float64: `samples` x `samples` of them through each pixel."""
         if samples not in self._rays:
             self._rays[samples] = self._sampled_rays(samples)
         return self._rays[samples]
@@ -43,7 +43,7 @@ class Lens:
         return np.moveaxis(self.through(pixels).reshape(len(y), len(x), 3), -1, 0)
 
     def through(self, pixels: Floats) -> Floats:
-        """Unit vectors [N, 3] float64 through the places `pixels` [N, 2] of the raw image."""
+        """Return unit vectors [N, 3] float64 through the places `pixels` [N, 2] of the raw image."""
         normalised = self._normalised(pixels)
         rays = np.c_[normalised, np.ones(len(normalised))]
         if not self._rectified:
@@ -60,7 +60,7 @@ class Lens:
         return np.sqrt(np.maximum(down, 1e-9) * np.maximum(right, 1e-9))
 
     def _normalised(self, pixels: Floats) -> Floats:
-        """x / z and y / z [N, 2] of the raw camera's rays."""
+        """Return x / z and y / z [N, 2] of the raw camera's rays."""
         c = self._calibration
         if self._rectified:
             K = c.rectified_intrinsics

@@ -30,7 +30,7 @@ class Sweep(NamedTuple):
     """[M] number of the beam, from the lowest."""
 
 
-def base_T_lidar(lidar: Lidar) -> Pose:
+def lidar_mount(lidar: Lidar) -> Pose:
     """Return the LiDAR's place: x forward, z up."""
     pose = np.eye(4)
     pose[:3, 3] = lidar.position
@@ -52,15 +52,13 @@ def sweep(scene: Scene, lidar: Lidar, way: Way, stamp: float, period: float, see
 
 def _slice(scene: Scene, lidar: Lidar, way: Way, stamp: float, period: float, columns: Floats) -> Sweep:
     seconds = ((columns + 0.5) / lidar.columns - 0.5) * period
-    poses = np.einsum("cij,jk->cik", way.poses(stamp + seconds), base_T_lidar(lidar))
+    poses = np.einsum("cij,jk->cik", way.poses(stamp + seconds), lidar_mount(lidar))
     middle = stamp + float(seconds.mean())
     scene.set_moment(middle, way.pose(middle), way.speed(middle))
     own = _directions(lidar, columns)  # [C, B, 3]
     directions = np.einsum("cij,cbj->cbi", poses[:, :3, :3], own)
     origins = np.broadcast_to(poses[:, None, :3, 3], directions.shape)
-    rays = Rays(
-        (origins + lidar.nearest * directions).reshape(-1, 3).astype(np.float64), directions.reshape(-1, 3)
-    )
+    rays = Rays((origins + lidar.nearest * directions).reshape(-1, 3).astype(np.float64), directions.reshape(-1, 3))
     hits = scene.nearest(rays)
     distances = scene.exact_distances(rays, hits) + lidar.nearest
     faces = np.maximum(hits.faces, 0)
@@ -70,7 +68,7 @@ def _slice(scene: Scene, lidar: Lidar, way: Way, stamp: float, period: float, co
     points = own.reshape(-1, 3)[kept] * distances[kept, None]
     times = np.repeat(seconds, lidar.beams)[kept]
     if lidar.deskewed:
-        points = _deskewed(points, poses, kept // lidar.beams, inverse(way.pose(stamp) @ base_T_lidar(lidar)))
+        points = _deskewed(points, poses, kept // lidar.beams, inverse(way.pose(stamp) @ lidar_mount(lidar)))
     return Sweep(points, albedo * (0.25 + 0.75 * cosine), times, kept % lidar.beams)
 
 

@@ -110,7 +110,7 @@ class Light:
 
 
 def sun_direction(azimuth: float, elevation: float) -> Floats:
-    """Unit vector towards the sun; degrees, azimuth counter-clockwise from x."""
+    """Return unit vector towards the sun; degrees, azimuth counter-clockwise from x."""
     a, e = math.radians(azimuth), math.radians(elevation)
     return np.array([math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)])
 

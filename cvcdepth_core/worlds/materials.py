@@ -251,7 +251,7 @@ def _sign(surface: Surface, chosen: Ints, place: _Place) -> None:
 
 
 def _road(surface: Surface, chosen: Ints, place: _Place) -> None:
-    """u runs along the road, v to its left from its middle."""
+    """Apply it; u runs along the road, v to its left from its middle."""
     lane, first, wear = (place.parameter(i) for i in range(3))
     patched = noise(Noise.BLOTCHES, place.u * 5.0 + place.rows[16], place.v * 9.0, place.footprint * 7.0)
     repair = np.clip(1.5 * (patched - 2.4 + 1.7 * wear), 0.0, 1.0)

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.floating[Any]]
-Ints = NDArray[np.integer[Any]]
+Floats = NDArray[Any]
+Ints = NDArray[Any]
 
 _FLAT = 0.9  # of a normal's z: a face that is level enough to be mapped from above
 _MAX_AROUND_VERTEX = 24  # faces: those beyond do not take part in a smooth normal
@@ -97,7 +97,7 @@ def rotate(rotation: Floats, points: Floats) -> Floats:
 
 
 def face_normals(vertices: Floats, faces: Ints) -> Floats:
-    """Unit normals [F, 3]; zeros for faces without area."""
+    """Return unit normals [F, 3]; zeros for faces without area."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     normals = np.cross(b - a, c - a)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
@@ -182,7 +182,7 @@ def prism(
 def extruded(
     profile: Sequence[tuple[float, float]], width: float, material: int, insets: Sequence[float] | None = None
 ) -> Mesh:
-    """A side view, counter-clockwise outline of (x, z), drawn out along y by `width`.
+    """Return A side view, counter-clockwise outline of (x, z), drawn out along y by `width`.
 
     `insets` narrow each of its points on both sides, metres.
     """
@@ -202,7 +202,7 @@ def extruded(
 
 
 def tube(points: Any, radii: Any, material: int, sides: int = 6, closed: bool = True) -> Mesh:
-    """A round tube along points [M, 3] with the radii [M]; u runs around it, v along it."""
+    """Return A round tube along points [M, 3] with the radii [M]; u runs around it, v along it."""
     points, radii = np.asarray(points, np.float64), np.asarray(radii, np.float64)
     along = np.gradient(points, axis=0)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
@@ -266,7 +266,7 @@ def _fan(centre: Floats, ring: Floats, material: int) -> Mesh:
 
 @lru_cache
 def _icosphere(subdivisions: int) -> tuple[Floats, Ints]:
-    """Unit sphere of 20 * 4^subdivisions triangles."""
+    """Return unit sphere of 20 * 4^subdivisions triangles."""
     p = (1 + 5**0.5) / 2
     corners = [(-1, p, 0), (1, p, 0), (-1, -p, 0), (1, -p, 0), (0, -1, p), (0, 1, p), (0, -1, -p), (0, 1, -p)]
     corners += [(p, 0, -1), (p, 0, 1), (-p, 0, -1), (-p, 0, 1)]
@@ -301,5 +301,5 @@ def sphere(radius: float, material: int, subdivisions: int = 2, roughness: Float
 
 
 def sphere_vertices(subdivisions: int) -> Floats:
-    """Unit directions [V, 3] of the vertices of `sphere`, in their order."""
+    """Return unit directions [V, 3] of the vertices of `sphere`, in their order."""
     return _icosphere(subdivisions)[0]

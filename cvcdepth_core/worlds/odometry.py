@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -34,7 +35,7 @@ def told_motion(way: Way, odometry: Odometry, start: float, stop: float, seed: t
     times = [start + i / odometry.rate for i in range(count)]
     poses = list(way.poses(np.array(times) - odometry.latency))
     speeds = [way.speed(time - odometry.latency) for time in times]
-    steps = [inverse(a) @ b for a, b in zip(poses[:-1], poses[1:], strict=True)]
+    steps = [inverse(a) @ b for a, b in itertools.pairwise(poses)]
     turns = [float(np.arctan2(step[1, 0], step[0, 0])) * odometry.rate for step in steps]
     turns.append(turns[-1] if turns else 0.0)
     if odometry.scale != 1.0 or odometry.noise or odometry.yaw_drift:

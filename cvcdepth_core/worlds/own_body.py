@@ -55,7 +55,7 @@ def _flattening(body: Mesh, cameras: Floats) -> float:
 
 
 def _robot(site: Site, dice: Dice, cameras: Floats) -> Mesh:
-    """A low platform on four wheels with a mast."""
+    """Return A low platform on four wheels with a mast."""
     skin, black = site.material(paint(dice.paint())), site.material(rubber())
     steel = site.material(metal((0.3, 0.3, 0.3)))
     length, width = 2 * max(0.3, np.abs(cameras[:, 0]).max() * 0.9), 2 * max(0.25, np.abs(cameras[:, 1]).max() * 0.8)

@@ -170,7 +170,7 @@ def stripes(first: Colour, second: Colour, period: float, upright: bool = False,
 
 
 def barrier_material(kind: BarrierKind, colour: Colour) -> Material:
-    """What a wall, fence or hedge is made of."""
+    """Return what a wall, fence or hedge is made of."""
     if kind == "brick_wall":
         return bricks(colour)
     if kind == "hedge":

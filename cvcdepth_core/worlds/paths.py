@@ -61,7 +61,7 @@ class Path:
         return np.stack([x, y], axis=-1)
 
     def locate(self, points: Floats) -> tuple[Floats, Floats]:
-        """s and l of points [N, 2], by the nearest place on the curve; beyond its ends s lies outside [0, length]."""
+        """Return s and l of points [N, 2], by the nearest place on the curve; beyond its ends s lies outside [0, length]."""
         coarse = self._points[::_SEARCH_STEP]
         nearest = np.empty(len(points), np.int64)
         for first in range(0, len(points), 4096):

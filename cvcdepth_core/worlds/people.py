@@ -95,8 +95,12 @@ def _rider(make: _Make, seat: float = 0.95) -> list[Mesh]:
     for side in (-1.0, 1.0):
         knee, foot = (0.2, side * 0.12, seat - 0.25 + side * 0.1), (0.05, side * 0.12, seat - 0.62 + side * 0.15)
         parts.append(_limb([(hip[0], side * 0.09, hip[1]), knee, foot], [0.085, 0.065, 0.045], make.lower))
-        grip = (0.45, side * 0.25, seat + 0.12)
-        parts.append(_limb([(shoulder[0], side * 0.18, shoulder[1] - 0.04), (0.3, side * 0.24, seat + 0.22), grip], [0.05, 0.042, 0.035], make.upper))  # fmt: skip
+        arm = [
+            (shoulder[0], side * 0.18, shoulder[1] - 0.04),
+            (0.3, side * 0.24, seat + 0.22),
+            (0.45, side * 0.25, seat + 0.12),
+        ]
+        parts.append(_limb(arm, [0.05, 0.042, 0.035], make.upper))
     return parts + _head(make, seat + 0.72, 1.72, x=0.18)
 
 

@@ -130,7 +130,7 @@ def barriers(kind: Kind, layout: Layout, dice: Dice) -> tuple[Barrier, ...]:
 
 
 def _line(kind: Kind, layout: Layout, dice: Dice, road: int, side: float) -> Iterator[Barrier]:
-    """The same barrier, or with a change of owner another, in stretches that end where something else stands."""
+    """Return the same barrier, or with a change of owner another, in stretches that end where something else stands."""
     first, last = layout.span(road)
     s, away = first, dice.between(0.25, 1.2)
     run: list[float] = []

@@ -54,10 +54,10 @@ def _row(kind: Kind, layout: Layout, dice: Dice, road: int, side: float) -> Iter
 def building(
     kind: Kind, dice: Dice, at: tuple[float, float], size: tuple[float, float, float], yaw: float, road: int = 0
 ) -> Building:
-    """A building of the kind of place."""
+    """Return A building of the kind of place."""
     wall: WallKind = dice.weighted(kind.walls)
     tall, height = size[2] > 9, size[2]
-    pitched = not tall and dice.chance(kind.pitched) or dice.chance(kind.pitched * 0.3)
+    pitched = (not tall and dice.chance(kind.pitched)) or dice.chance(kind.pitched * 0.3)
     return Building(
         at=at,
         yaw=yaw % 360,

@@ -23,7 +23,7 @@ class Special:
 
 
 def special_places(world: WorldSpec, layout: Layout, dice: Dice) -> Special:
-    """What belongs to the kind of place, and what any road may have."""
+    """Return what belongs to the kind of place, and what any road may have."""
     special = Special()
     if world.kind == "tunnel":
         special.structures += (_tunnel(world, layout, dice),)

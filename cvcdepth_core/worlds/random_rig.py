@@ -24,7 +24,10 @@ def random_rig(seed: int, cameras: int | None = None) -> RigLayout:
         view = max(view, 70.0)
     pitch = dice.normal(4.0)
     reach = (dice.between(0.25, 1.9), dice.between(0.15, 0.85))
-    shape, model = dice.pick(*_SHAPES), dice.weighted({"none": 0.5, "plumb_bob": 0.25, "rational_polynomial": 0.1, "equidistant": 0.15})
+    shape, model = (
+        dice.pick(*_SHAPES),
+        dice.weighted({"none": 0.5, "plumb_bob": 0.25, "rational_polynomial": 0.1, "equidistant": 0.15}),
+    )
     first = 0.0 if dice.chance(0.8) else 180.0 / count
     spread = 360.0 if dice.chance(0.85) else dice.between(90, 200)
     entries = []
@@ -43,7 +46,7 @@ def _place(dice: Dice, yaw: float, reach: tuple[float, float], height: float) ->
 
 
 def _mount(yaw: float, pitch: float, roll: float, place: tuple[float, float, float]) -> Pose:
-    """Return base_T_camera of a camera that looks so many degrees to the left and up, turned about its axis by `roll`."""
+    """Return base_T_camera of a camera that looks so many degrees to the left and up, rolled about its axis."""
     a, p, r = (math.radians(angle) for angle in (yaw, pitch, roll))
     forward = np.array([math.cos(a) * math.cos(p), math.sin(a) * math.cos(p), math.sin(p)])
     right = np.array([math.sin(a), -math.cos(a), 0.0])

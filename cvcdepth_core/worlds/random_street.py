@@ -30,7 +30,7 @@ def furniture(world: WorldSpec, kind: Kind, layout: Layout, dice: Dice) -> tuple
 
 
 def _beside(layout: Layout, side: float, dice: Dice, road: int = 0) -> float:
-    """l of something on the pavement near the kerb, or beyond the edge where there is none."""
+    """Return l of something on the pavement near the kerb, or beyond the edge where there is none."""
     kerb, edge = layout.kerb(side, road), layout.edge(side, road)
     return round(side * (kerb + 0.5 if edge - kerb > 1.0 else edge + dice.between(0.3, 1.2)), 2)
 
@@ -137,7 +137,7 @@ def _clutter(world: WorldSpec, kind: Kind, layout: Layout, dice: Dice) -> Iterat
 
 
 def _road_works(world: WorldSpec, layout: Layout, dice: Dice) -> Iterator[Furniture]:
-    """A row of cones or barrels along a lane's edge."""
+    """Return A row of cones or barrels along a lane's edge."""
     if not dice.chance(0.15):
         return
     name: FurnitureKind = dice.pick("cone", "barrel")

@@ -17,21 +17,22 @@ def complete_layout(layout: RigLayout, where: str) -> RigLayout:
     return layout
 
 
-def layout_at_size(layout: RigLayout, size: tuple[int, int] | None) -> RigLayout:
-    """Return a rig whose pictures are `size` (width, height) in pixels; None leaves them as they are.
+def layout_at_size(layout: RigLayout, size: tuple[int, int] | None, usual_width: int) -> RigLayout:
+    """Return a rig whose pictures are `size` (width, height) in pixels; None: `usual_width` wide, in their own shape.
 
     Each camera keeps its horizontal view and its square pixels: where the shape differs, rows are added or taken away
     evenly above and below. Binning and regions of interest are applied, masks are left out: they belong to the former
     pictures.
     """
-    cameras = tuple(_resized(camera, size) for camera in layout.cameras)
+    cameras = tuple(_resized(camera, size, usual_width) for camera in layout.cameras)
     return layout.model_copy(update={"cameras": cameras})
 
 
-def _resized(camera: CameraEntry, size: tuple[int, int] | None) -> CameraEntry:
+def _resized(camera: CameraEntry, size: tuple[int, int] | None, usual_width: int) -> CameraEntry:
     if camera.calibration is None:
         return camera
-    calibration = _at_size(camera.name, camera.calibration, size or camera.calibration.image_size)
+    width, height = camera.calibration.image_size
+    calibration = _at_size(camera.name, camera.calibration, size or (usual_width, round(usual_width * height / width)))
     return camera.model_copy(update={"calibration": calibration, "mask": None, "mask_polygons": ()})
 
 

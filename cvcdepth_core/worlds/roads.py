@@ -69,7 +69,7 @@ class _RoadBuilder:
         self._verge(side, outer, road.kerb if width > 0 else 0.0)
 
     def _slab(self, inner: float, outer: float, top: int, sides: int) -> Iterator[Mesh]:
-        """A raised strip with its sides and ends, wherever no other road runs."""
+        """Return A raised strip with its sides and ends, wherever no other road runs."""
         across = np.array([inner, (inner + outer) / 2, outer])
         free = ~self._in_other_carriageway(self.stations, across, 0.0).any(axis=1)
         up, down = max(self.road.kerb, 0.01), -0.3
@@ -230,7 +230,7 @@ def _on_carriageway(corridor: Corridor, points: Floats, margin: float) -> Floats
 
 
 def _runs(flags: Floats) -> Sequence[slice]:
-    """The stretches of True."""
+    """Return the stretches of True."""
     edges = np.flatnonzero(np.diff(np.r_[False, flags, False]))
     return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 

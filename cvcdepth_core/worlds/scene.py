@@ -90,7 +90,7 @@ class Scene:
         self._moving = TriangleScene(corners)
 
     def nearest(self, rays: Rays) -> Hits:
-        """What the rays meet first; faces are numbered as in `faces`."""
+        """Return what the rays meet first; faces are numbered as in `faces`."""
         origins, directions = _single(rays.origins), _single(rays.directions)
         still = self._still.nearest(origins, directions)
         moving = self._moving.nearest(origins, directions, still.distances)

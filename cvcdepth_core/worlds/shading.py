@@ -137,7 +137,7 @@ def _with_reflections(scene: Scene, places: _Places, lit: Floats, spread: Floats
 
 
 def _mirrored(scene: Scene, places: _Places, shiny: Ints, spread: Floats) -> Floats:
-    """What the shiny places reflect: what stands around in plain light, and the sky."""
+    """Return what the shiny places reflect: what stands around in plain light, and the sky."""
     light = scene.world.light
     incoming, normals = places.directions[:, shiny], places.normals[:, shiny]
     outgoing = incoming - 2.0 * (incoming * normals).sum(axis=0) * normals

@@ -70,7 +70,7 @@ class Site:
         return x, y
 
     def height_on(self, x: float, y: float) -> float:
-        """z of what one stands on: a pavement's upper side, a road, the ground."""
+        """Return z of what one stands on: a pavement's upper side, a road, the ground."""
         return self.terrain.at(x, y) + self.raised(np.array([[x, y]])).item()
 
     def raised(self, points: Floats) -> Floats:

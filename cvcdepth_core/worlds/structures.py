@@ -49,7 +49,7 @@ class _Make:
 
 
 def _bridge(m: _Make) -> Iterator[Mesh]:
-    """Runs across: its deck is `length` wide along the road below, and `width` long."""
+    """Build what runs across: its deck is `length` wide along the road below, and `width` long."""
     yield box(m.length, m.width, 1.1, m.concrete, m.height)
     for x in (-m.length / 2 + 0.15, m.length / 2 - 0.15):
         yield box(0.3, m.width, 1.0, m.dark, m.height + 1.1).moved(x)
@@ -117,7 +117,7 @@ def _crane(m: _Make) -> Iterator[Mesh]:
 
 
 def _tower(m: _Make) -> Iterator[Mesh]:
-    """A silo or water tower."""
+    """Return A silo or water tower."""
     radius = min(m.length, m.width) / 2
     yield cylinder(radius, m.height, m.concrete, 24)
     yield cylinder(radius * 1.02, 0.4, m.dark, 24, m.height * 0.5)

@@ -37,7 +37,7 @@ class Corridor:
 
     @property
     def carriageway(self) -> tuple[float, float]:
-        """l of the right and of the left edge of the carriageway."""
+        """Return l of the right and of the left edge of the carriageway."""
         half = self.road.lanes * self.road.lane_width / 2
         return -half - self.road.edge[1], half + self.road.edge[0]
 
@@ -57,7 +57,7 @@ class Terrain:
         self.corridors = corridors
 
     def height(self, points: Floats) -> Floats:
-        """z [N] at x, y [N, 2]; roads lie on it."""
+        """Return z [N] at x, y [N, 2]; roads lie on it."""
         x, y = points.T
         z = np.zeros(len(points))
         for wave in self.ground.waves:
@@ -70,7 +70,7 @@ class Terrain:
         return z
 
     def at(self, x: float, y: float) -> float:
-        """z at one place."""
+        """Return z at one place."""
         return float(self.height(np.array([[x, y]]))[0])
 
     def _banks(self, number: int, points: Floats) -> Floats:

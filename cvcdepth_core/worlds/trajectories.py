@@ -110,7 +110,7 @@ def _unit(vectors: Floats) -> Floats:
 
 
 def vehicle_trajectory(site: Site, placed: Placed, motion: Motion | Drive, length: float = 4.5) -> Trajectory:
-    """The way of a vehicle: on the terrain, without pavements."""
+    """Return the way of a vehicle: on the terrain, without pavements."""
     path, start = _way(site, placed, motion)
     sprung = isinstance(motion, Drive)
     profile = SpeedProfile(motion.speeds)
@@ -118,7 +118,7 @@ def vehicle_trajectory(site: Site, placed: Placed, motion: Motion | Drive, lengt
 
 
 def person_trajectory(site: Site, placed: Placed, motion: Motion) -> Trajectory:
-    """The way of somebody on foot or on two wheels, also on pavements."""
+    """Return the way of somebody on foot or on two wheels, also on pavements."""
     path, start = _way(site, placed, motion)
 
     def height(points: Floats) -> Floats:
@@ -128,7 +128,7 @@ def person_trajectory(site: Site, placed: Placed, motion: Motion) -> Trajectory:
 
 
 def _way(site: Site, placed: Placed, motion: Motion | Drive) -> tuple[Path, float]:
-    """The curve, and how far along it the start is."""
+    """Return the curve, and how far along it the start is."""
     place = site.place(placed)
     if motion.bends is not None or placed.road is None:
         bends = motion.bends or ()

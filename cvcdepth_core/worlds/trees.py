@@ -55,7 +55,7 @@ def _trunk_stretched(mesh: Mesh, trunk: float) -> Mesh:
 
 @lru_cache(maxsize=128)
 def _template(kind: str, variant: int, detail: int) -> Mesh:
-    """A tree one metre high and wide, the crown's middle above the trunk."""
+    """Return A tree one metre high and wide, the crown's middle above the trunk."""
     rng = np.random.default_rng([17, variant, sum(kind.encode())])
     if kind == "bush":
         return _bush(rng, detail)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -74,7 +75,7 @@ def build_vehicles(site: Site) -> None:
 
 
 def vehicle_mesh(site: Site, vehicle: Vehicle) -> Mesh:
-    """The vehicle in its own frame, on the ground."""
+    """Return the vehicle in its own frame, on the ground."""
     rng = np.random.default_rng([site.spec.seed, vehicle.seed, 13])
     make = _Make(site, vehicle.colour, rng)
     if vehicle.kind in _SHAPES:
@@ -83,7 +84,7 @@ def vehicle_mesh(site: Site, vehicle: Vehicle) -> Mesh:
 
 
 def car_mesh(site: Site, kind: VehicleKind, colour: Colour, rng: np.random.Generator) -> Mesh:
-    """A car, pickup, van or minibus."""
+    """Return A car, pickup, van or minibus."""
     make, shape = _Make(site, colour, rng), _varied(_SHAPES[kind], rng)
     parts = [_body(make, shape, kind), *_wheels(make, shape), *_lights(make, shape), *_trims(make, shape, kind)]
     return joined(parts)
@@ -111,7 +112,7 @@ class _Make:
 
 
 def _varied(shape: _Shape, rng: np.random.Generator) -> _Shape:
-    """The same kind of car by another maker."""
+    """Return the same kind of car by another maker."""
     length, width, height = (np.array([shape.length, shape.width, shape.height]) * rng.uniform(0.94, 1.06, 3)).tolist()
     factor = height / shape.height
     front = shape.roof[1] + rng.uniform(-0.02, 0.02)
@@ -192,6 +193,7 @@ def _stations(s: _Shape, kind: VehicleKind) -> list[_Station]:
     """Cross-sections from the rear end to the front."""
     w, belt = s.width / 2, s.belt
     glass_wide, roof_wide = w - 0.06, w * 0.76 if kind not in ("van", "minibus") else w * 0.88
+    bonnet = 0.55 * belt + 0.45 * s.bonnet + 0.03
     along = [
         # share of the length, underside, belt, top, wide, belt wide, top wide
         (0.0, s.clearance + 0.14, s.boot * 0.8, s.boot * 0.93, w - 0.13, w - 0.17, w * 0.7),
@@ -201,7 +203,7 @@ def _stations(s: _Shape, kind: VehicleKind) -> list[_Station]:
         ((s.roof[0] + s.roof[1]) / 2, s.clearance, belt, s.height, w, glass_wide, roof_wide),
         (s.roof[1], s.clearance, belt, s.height - 0.035, w, glass_wide, roof_wide),
         (s.cowl, s.clearance, belt, belt + 0.03, w, glass_wide, w * 0.8),
-        (0.5 * (s.cowl + 1.0), s.clearance, 0.6 * belt + 0.4 * s.bonnet, 0.55 * belt + 0.45 * s.bonnet + 0.03, w - 0.01, w - 0.1, w * 0.74),
+        (0.5 * (s.cowl + 1.0), s.clearance, 0.6 * belt + 0.4 * s.bonnet, bonnet, w - 0.01, w - 0.1, w * 0.74),
         (0.965, s.clearance, s.bonnet - 0.03, s.bonnet, w - 0.06, w - 0.13, w * 0.68),
         (0.99, s.clearance + 0.03, s.bonnet * 0.86, s.bonnet * 0.9, w - 0.13, w - 0.2, w * 0.62),
         (1.0, s.clearance + 0.1, s.bonnet * 0.7, s.bonnet * 0.76, w - 0.2, w - 0.27, w * 0.55),
@@ -219,7 +221,7 @@ def _skin(make: _Make, s: _Shape, kind: VehicleKind, stations: list[_Station]) -
     """Material of each cell between two stations and two points of the outline, both halves."""
     shares = [(station.x + s.length / 2) / s.length for station in stations]
     rows = []
-    for first, last in zip(shares[:-1], shares[1:], strict=True):
+    for first, last in itertools.pairwise(shares):
         row = np.full(8, make.paint)
         row[_SKIRT] = make.black
         middle = (first + last) / 2

@@ -34,6 +34,6 @@ def save_world(path: Path, world: WorldSpec, comment: str = "") -> None:
 
 
 def world_text(world: WorldSpec) -> str:
-    """The world as YAML, one line for each part where it fits."""
+    """Return the world as YAML, one line for each part where it fits."""
     content = world.model_dump(mode="json", exclude_defaults=True)
     return yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True)

@@ -34,29 +34,44 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="folder to create")
     parser.add_argument(
         "--rig", default="nuscenes", metavar="RIG",
-        help="rig file with calibrations and mounts; or a rig like that of ddad, nuscenes or pandaset; or random [nuscenes]",
+        help="rig file with calibrations and mounts; or one like that of ddad, nuscenes or pandaset; or random [nuscenes]",
     )  # fmt: skip
     parser.add_argument(
         "--world", default="random", metavar="WORLD",
         help="world file; or a whole number: the world of that seed; or a kind of place, as city or forest [random]",
     )  # fmt: skip
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of random rigs and worlds, and of all noise [0]")
+    parser.add_argument(
+        "--seed", type=int, default=0, metavar="N", help="of random rigs and worlds, and of all noise [0]"
+    )
     parser.add_argument("--seconds", type=positive, default=5.0, metavar="S", help="length of the drive [5]")
     parser.add_argument("--rate", type=positive, metavar="HZ", help="pictures per second of each camera [10]")
-    parser.add_argument("--size", type=_size, metavar="WxH", help="pixels of every picture [480 wide, in the rig's shape]")
-    parser.add_argument("--images", choices=("jpeg", "png", "raw"), default="jpeg", help="how pictures are stored [jpeg]")
+    parser.add_argument(
+        "--size", type=_size, metavar="WxH", help="pixels of every picture [480 wide, in the rig's shape]"
+    )
+    parser.add_argument(
+        "--images", choices=("jpeg", "png", "raw"), default="jpeg", help="how pictures are stored [jpeg]"
+    )
     parser.add_argument("--quality", type=_quality, default=92, metavar="N", help="of JPEG, 1 to 100 [92]")
     parser.add_argument(
-        "--truth", choices=("none", "depth", "all"), default="depth", help="depth, or objects and what moves too [depth]"
+        "--truth",
+        choices=("none", "depth", "all"),
+        default="depth",
+        help="depth, or objects and what moves too [depth]",
     )
-    parser.add_argument("--look", choices=("clean", "varied"), default="varied", help="ideal cameras or real ones [varied]")
+    parser.add_argument(
+        "--look", choices=("clean", "varied"), default="varied", help="ideal cameras or real ones [varied]"
+    )
     parser.add_argument("--odometry", choices=("exact", "wheels"), default="exact", help="true, or with errors [exact]")
     parser.add_argument("--body", choices=("none", "car", "van", "robot"), default="none", help="body in view [none]")
-    parser.add_argument("--stagger", type=_share, metavar="X", help="share of a period in which cameras fire in turn [0.6]")
+    parser.add_argument(
+        "--stagger", type=_share, metavar="X", help="share of a period in which cameras fire in turn [0.6]"
+    )
     parser.add_argument("--readout", type=non_negative, metavar="S", help="seconds of a rolling shutter [0]")
     parser.add_argument("--no-lidar", action="store_true", help="without LiDAR")
     parser.add_argument("--sensors", type=Path, metavar="FILE", help="file of sensors, for everything else; see docs")
-    parser.add_argument("--samples", type=int, choices=(1, 2, 3, 4), default=2, help="rays per pixel along each axis [2]")
+    parser.add_argument(
+        "--samples", type=int, choices=(1, 2, 3, 4), default=2, help="rays per pixel along each axis [2]"
+    )
     parser.add_argument("--workers", type=_whole, default=0, metavar="N", help="processes [one for each processor]")
     add_quiet(parser)
     add_json(parser)

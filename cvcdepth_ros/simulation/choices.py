@@ -26,6 +26,7 @@ from cvcdepth_ros.installation import share_directory
 
 KNOWN_RIGS = ("ddad", "nuscenes", "pandaset")
 RANDOM = "random"
+_USUAL_WIDTH = 480  # pixels
 OdometryChoice = Literal["exact", "wheels"]
 LookChoice = Literal["clean", "varied"]
 _WHEELS = Odometry(scale=1.01, noise=0.05, yaw_drift=0.001, latency=0.01)
@@ -34,12 +35,13 @@ _WHEELS = Odometry(scale=1.01, noise=0.05, yaw_drift=0.001, latency=0.01)
 def chosen_layout(rig: str, size: tuple[int, int] | None, seed: int) -> RigLayout:
     """Return the rig of a file, one like a data set's, or a random one, with pictures of `size` (width, height).
 
+    Without a size, pictures are 480 pixels wide and keep their shape.
     RigError names the file and the camera that lacks its calibration or mount.
     """
     if rig == RANDOM:
-        return layout_at_size(random_rig(seed), size)
+        return layout_at_size(random_rig(seed), size, _USUAL_WIDTH)
     path = share_directory() / "config" / "rigs" / "simulated" / f"{rig}.yaml" if rig in KNOWN_RIGS else Path(rig)
-    return layout_at_size(complete_layout(load_rig_layout(path), f"rig file {path}"), size)
+    return layout_at_size(complete_layout(load_rig_layout(path), f"rig file {path}"), size, _USUAL_WIDTH)
 
 
 def chosen_world(world: str, seed: int, seconds: float) -> WorldSpec:
@@ -66,11 +68,16 @@ def chosen_sensors(cameras: int, look: LookChoice, odometry: OdometryChoice, see
 
 
 def _varied_looks(cameras: int, seed: int) -> Sequence[CameraLook]:
-    """Looks of one maker's cameras, which differ by a few per cent."""
+    """Return looks of one maker's cameras, which differ by a few per cent."""
     dice = Dice(seed, 307)
     common = random_look(dice)
     return tuple(
-        common.model_copy(update={"key": round(common.key * dice.scale(0.92, 1.09), 4), "dirt": max(0.0, common.dirt + dice.normal(0.1))})
+        common.model_copy(
+            update={
+                "key": round(common.key * dice.scale(0.92, 1.09), 4),
+                "dirt": max(0.0, common.dirt + dice.normal(0.1)),
+            }
+        )
         for _ in range(cameras)
     )
 

@@ -33,7 +33,11 @@ def serialized(type_name: str, content: Any) -> bytes:
 def header(stamp: int, frame_id: str) -> Any:
     """Build a header; `stamp` in nanoseconds."""
     seconds, rest = divmod(stamp, NANOSECONDS)
-    return message("std_msgs/msg/Header", stamp=message("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest), frame_id=frame_id)
+    return message(
+        "std_msgs/msg/Header",
+        stamp=message("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest),
+        frame_id=frame_id,
+    )
 
 
 def compressed_image(stamp: int, frame_id: str, picture: NDArray[np.uint8], form: str, quality: int) -> Any:

@@ -25,7 +25,9 @@ Progress = Callable[[int], None]
 """Called with the number of finished sets."""
 
 
-def record(spec: DriveSpec, form: Form, output: Path, workers: int = 1, progress: Progress = lambda _: None) -> dict[str, Any]:
+def record(
+    spec: DriveSpec, form: Form, output: Path, workers: int = 1, progress: Progress = lambda _: None
+) -> dict[str, Any]:
     """Simulate a drive into a new rosbag2 folder `output`, with its rig file, its world file and a JSON of all choices.
 
     Sets that an interrupted run of the same drive finished are not done again. The result is the same to the byte for

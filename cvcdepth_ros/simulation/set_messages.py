@@ -10,7 +10,7 @@ import numpy as np
 
 from cvcdepth_core.rig.rig import CameraEntry, RigLayout
 from cvcdepth_core.worlds.drive import DriveSpec, SimulatedDrive
-from cvcdepth_core.worlds.lidar import base_T_lidar
+from cvcdepth_core.worlds.lidar import lidar_mount
 from cvcdepth_core.worlds.odometry import Told
 from cvcdepth_ros.simulation.messages import (
     NANOSECONDS,
@@ -122,13 +122,13 @@ def static_transforms(spec: DriveSpec) -> Stored:
         for entry, camera in zip(spec.layout.cameras, spec.layout.complete().cameras, strict=True)
     }
     if spec.sensors.lidar is not None:
-        frames[LIDAR_FRAME] = base_T_lidar(spec.sensors.lidar)
+        frames[LIDAR_FRAME] = lidar_mount(spec.sensors.lidar)
     stamp = stamp_of(-0.5)
     return _stored("/tf_static", "tf", stamp, transforms(stamp, spec.layout.base_frame, frames))
 
 
 def motion_messages(drive: SimulatedDrive) -> list[Stored]:
-    """What the vehicle believes about its motion, on `/odom` and `/tf`, and the truth where that differs."""
+    """Return what the vehicle believes about its motion, on `/odom` and `/tf`, and the truth where that differs."""
     told = drive.odometry()
     base = drive.spec.layout.base_frame
     found = []
