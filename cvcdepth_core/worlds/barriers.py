@@ -108,13 +108,13 @@ def _hedge(length: float, height: float, material: int, _: int, rng: np.random.G
     """Return A trimmed body with leaves that stick out of it."""
     depth = min(0.9, 0.35 + 0.3 * height)
     yield box(length + 0.06, 0.8 * depth, 0.95 * height, material, -0.1, (1.0, 0.85))
-    count = int(70 * length * height / 2.5) + 30
+    count = int(110 * length * height / 2.5) + 40
     places = rng.uniform(-0.5, 0.5, (count, 3)) * (length, depth, height) + (0, 0, height / 2)
     face = rng.integers(0, 3, count)
     places[face == 0, 1] = -depth / 2 + rng.normal(0, 0.04, (face == 0).sum())
     places[face == 1, 1] = depth / 2 + rng.normal(0, 0.04, (face == 1).sum())
     places[face == 2, 2] = height + rng.normal(0, 0.05, (face == 2).sum())
-    corners = places[:, None] + rng.normal(0, 0.075, (count, 3, 3))
+    corners = places[:, None] + rng.normal(0, 0.05, (count, 3, 3))
     outward = np.select([(face == 0)[:, None], (face == 1)[:, None]], [(0, -1.0, 0.4), (0, 1.0, 0.4)], (0, 0, 1.0))
     outward = outward + 0.4 * sphere_vertices(2)[rng.integers(0, len(sphere_vertices(2)), count)]
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)

@@ -15,6 +15,7 @@ from cvcdepth_core.worlds.buildings import build_buildings
 from cvcdepth_core.worlds.description import Sky, Weather, WorldSpec
 from cvcdepth_core.worlds.furniture import LAMP_ARM, build_furniture, furniture_height
 from cvcdepth_core.worlds.ground import build_ground, build_patches
+from cvcdepth_core.worlds.horizon import build_horizon, build_tall_grass
 from cvcdepth_core.worlds.light import Lamps, Light, sun_direction, sunlight
 from cvcdepth_core.worlds.meshes import Mesh
 from cvcdepth_core.worlds.own_body import BodyKind, own_body
@@ -55,6 +56,8 @@ def build_world(
     build_ground(site)
     build_roads(site)
     build_patches(site)
+    build_horizon(site)
+    build_tall_grass(site)
     for build in (build_buildings, build_structures, build_barriers, build_wires, build_trees, build_furniture):
         build(site)
     build_vehicles(site)

@@ -87,6 +87,17 @@ class Bank(Part):
     """Where it ends."""
 
 
+class Horizon(Part):
+    """What closes the view far away."""
+
+    kind: Literal["hills", "woods", "town"]
+    distance: float = Field(default=250.0, ge=100.0, le=3000.0)
+    """From the roads."""
+    height: Length = 15.0
+    colour: Colour = (0.06, 0.09, 0.03)
+    seed: int = 0
+
+
 class Ground(Part):
     """The ground between and beyond roads."""
 
@@ -97,6 +108,8 @@ class Ground(Part):
     waves: tuple[Wave, ...] = ()
     rough: Share = 0.0
     """Small unevenness, as a share of 0.3 m."""
+    tall: Share = 0.0
+    """How much grass stands beside the roads, and how high, as a share of 0.7 m."""
     margin: Length = 110.0
     """How far it is modelled beyond the roads; then it goes on flat."""
 
@@ -302,6 +315,7 @@ class WorldSpec(Part):
     sky: Sky = Sky()
     ground: Ground = Ground()
     roads: tuple[Road, ...] = ()
+    horizon: tuple[Horizon, ...] = ()
     patches: tuple[Patch, ...] = ()
     buildings: tuple[Building, ...] = ()
     barriers: tuple[Barrier, ...] = ()
@@ -316,7 +330,7 @@ class WorldSpec(Part):
     @model_validator(mode="after")
     def _check(self) -> WorldSpec:
         placed = {name: getattr(self, name) for name in type(self).model_fields if name != "roads"}
-        lists = {name: parts for name, parts in placed.items() if isinstance(parts, tuple)}
+        lists = {name: parts for name, parts in placed.items() if isinstance(parts, tuple) and name != "horizon"}
         for name, parts in (lists | {"drive": (self.drive,)}).items():
             for number, part in enumerate(parts):
                 road = part.road

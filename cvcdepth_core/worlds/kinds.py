@@ -13,6 +13,7 @@ WorldKind = Literal[
     "city", "suburb", "rural", "forest", "highway", "square", "yard", "industrial", "tunnel", "parking_deck"
 ]
 Range = tuple[float, float]
+HorizonKind = Literal["hills", "woods", "town"]
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,8 @@ class Kind:
     lanes: tuple[int, ...]
     speed: Range
     edge: Range = (0.2, 0.6)
+    parking: float = 0.0
+    """Chance, on each side, of an edge that is wide enough to park on."""
     open_width: Range = (20.0, 50.0)
     """Width of the paved place where there are no lanes."""
     one_way: float = 0.0
@@ -56,6 +59,10 @@ class Kind:
     """Single trees behind the road."""
     woods: Range = (0, 0)
     """Trees of a wood."""
+    horizon: Mapping[HorizonKind, float] = None  # type: ignore[assignment]
+    """Chance of each thing far away."""
+    tall_grass: float = 0.0
+    """Chance of tall grass beside the road."""
     bushes: Range = (0, 10)
     barriers: float = 0.3
     barrier_kinds: tuple[BarrierKind, ...] = ("wall", "brick_wall", "fence", "railing", "mesh", "hedge")
@@ -78,10 +85,13 @@ _HOUSE_WALLS: Mapping[WallKind, float] = {"plaster": 0.4, "brick": 0.3, "boards"
 
 KINDS: Mapping[WorldKind, Kind] = {
     "city": Kind(
+        horizon={"town": 0.9, "hills": 0.2},
+        tall_grass=0.05,
         weight=0.27,
         lanes=(2, 2, 2, 3, 4, 4),
         speed=(3.0, 13.0),
-        edge=(0.3, 2.6),
+        edge=(0.3, 0.8),
+        parking=0.6,
         one_way=0.25,
         surfaces=_SEALED,
         pavement=(1.8, 5.0),
@@ -113,10 +123,13 @@ KINDS: Mapping[WorldKind, Kind] = {
         cyclists=(0, 4),
     ),
     "suburb": Kind(
+        horizon={"town": 0.35, "woods": 0.45, "hills": 0.4},
+        tall_grass=0.25,
         weight=0.25,
         lanes=(2,),
         speed=(4.0, 12.0),
-        edge=(0.2, 2.3),
+        edge=(0.2, 0.6),
+        parking=0.4,
         surfaces=_SEALED,
         pavement=(0.0, 2.8),
         curved=0.5,
@@ -149,6 +162,8 @@ KINDS: Mapping[WorldKind, Kind] = {
         cyclists=(0, 3),
     ),
     "rural": Kind(
+        horizon={"town": 0.1, "woods": 0.65, "hills": 0.55},
+        tall_grass=0.6,
         weight=0.12,
         lanes=(1, 2, 2, 2),
         speed=(6.0, 20.0),
@@ -184,6 +199,8 @@ KINDS: Mapping[WorldKind, Kind] = {
         cyclists=(0, 2),
     ),
     "forest": Kind(
+        horizon={"woods": 0.95, "hills": 0.3},
+        tall_grass=0.6,
         weight=0.07,
         lanes=(1, 2),
         speed=(3.0, 14.0),
@@ -213,6 +230,8 @@ KINDS: Mapping[WorldKind, Kind] = {
         cyclists=(0, 2),
     ),
     "highway": Kind(
+        horizon={"town": 0.4, "woods": 0.5, "hills": 0.45},
+        tall_grass=0.5,
         weight=0.09,
         lanes=(3, 4, 4, 5, 6),
         speed=(12.0, 28.0),
@@ -245,6 +264,7 @@ KINDS: Mapping[WorldKind, Kind] = {
         parked=(0.0, 0.0),
     ),
     "square": Kind(
+        horizon={"town": 0.8},
         weight=0.05,
         lanes=(0,),
         speed=(1.5, 5.0),
@@ -275,6 +295,8 @@ KINDS: Mapping[WorldKind, Kind] = {
         cyclists=(0, 6),
     ),
     "yard": Kind(
+        horizon={"town": 0.6, "woods": 0.2},
+        tall_grass=0.15,
         weight=0.04,
         lanes=(0,),
         speed=(1.0, 4.0),
@@ -304,10 +326,13 @@ KINDS: Mapping[WorldKind, Kind] = {
         people=(0, 8),
     ),
     "industrial": Kind(
+        horizon={"town": 0.7, "woods": 0.3, "hills": 0.3},
+        tall_grass=0.25,
         weight=0.06,
         lanes=(2, 2, 3),
         speed=(4.0, 13.0),
-        edge=(0.3, 3.0),
+        edge=(0.3, 1.0),
+        parking=0.5,
         surfaces=_SEALED,
         pavement=(0.0, 3.0),
         curved=0.25,
@@ -338,6 +363,8 @@ KINDS: Mapping[WorldKind, Kind] = {
         cyclists=(0, 1),
     ),
     "tunnel": Kind(
+        horizon={"hills": 0.9, "woods": 0.4},
+        tall_grass=0.3,
         weight=0.03,
         lanes=(2, 2, 3, 4),
         speed=(8.0, 18.0),
@@ -358,6 +385,7 @@ KINDS: Mapping[WorldKind, Kind] = {
         parked=(0.0, 0.0),
     ),
     "parking_deck": Kind(
+        horizon={"town": 0.7},
         weight=0.02,
         lanes=(0,),
         speed=(1.0, 3.5),

@@ -85,6 +85,8 @@ class Material:
     fine: Layer = Layer(Noise.ROUGH, 90.0, 0.08)
     gloss: float = 0.0
     """Strength of mirror-like reflection, 0 to 1."""
+    ripple: float = 0.0
+    """Unevenness that bends reflections and leaves dry places, as of a wet road; 0 is a mirror."""
     leafy: float = 0.0
     """How much light passes through, 0 to 1."""
     emission: float = 0.0
@@ -121,7 +123,7 @@ def _row(material: Material, number: int) -> tuple[float, ...]:
     # Each material begins elsewhere in the tiles, so that like ones side by side do not look alike.
     offset = np.random.default_rng([7, number]).uniform(0.0, 256.0, 2).tolist()
     layers = (m.coarse.kind, m.coarse.texels, m.coarse.amplitude, m.fine.kind, m.fine.texels, m.fine.amplitude)
-    return (m.pattern, *m.colour, *m.second, *layers, m.gloss, m.leafy, m.emission, *offset, 0, 0, 0, 0, *parameters)
+    return (m.pattern, *m.colour, *m.second, *layers, m.gloss, m.leafy, m.emission, *offset, m.ripple, 0, 0, 0, *parameters)
 
 
 class Surface(NamedTuple):
@@ -135,6 +137,8 @@ class Surface(NamedTuple):
     """[N]"""
     emission: Floats
     """[3, N] linear light."""
+    ripple: Floats
+    """[N] by how much reflections are bent."""
 
 
 class _Place(NamedTuple):
@@ -161,7 +165,9 @@ def evaluate(table: Floats, materials: Ints, u: Floats, v: Floats, footprint: Fl
     coarse = _layer(rows, 7, u, v, footprint)
     fine = _layer(rows, 10, u, v, footprint)
     shade = np.clip(1.0 + coarse + fine, 0.15, 2.2)
-    surface = Surface(rows[1:4] * shade, rows[13].copy(), rows[14], rows[1:4] * rows[15])
+    wet = np.clip(0.65 + 0.5 * coarse / np.maximum(rows[9], 1e-3), 0.1, 1.0)
+    gloss = rows[13] * np.where(rows[18] > 0, wet, 1.0)
+    surface = Surface(rows[1:4] * shade, gloss, rows[14], rows[1:4] * rows[15], rows[18] * fine / np.maximum(rows[12], 1e-3))
     place = _Place(rows, u, v, footprint, coarse, fine)
     pattern = rows[0].astype(np.int32)
     for number, apply in _PATTERNS.items():

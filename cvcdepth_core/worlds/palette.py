@@ -49,6 +49,7 @@ _GROUNDS: dict[SurfaceKind, Material] = {
         parameters=(0.14, 0.0),
     ),
 }
+_RIPPLE = 0.05
 _SEALED = ("asphalt", "concrete", "cobbles", "slabs", "planks")
 
 
@@ -73,6 +74,7 @@ def road_material(road: Road, wet: float) -> Material:
         coarse=base.coarse,
         fine=base.fine,
         gloss=0.75 * wet,
+        ripple=_RIPPLE,
         parameters=(road.lane_width if road.lanes else 0.0, first, road.wear),
     )
 
@@ -194,4 +196,4 @@ def lighter(colour: Colour, amount: float) -> Colour:
 
 def _recoloured(material: Material, colour: Colour, second: Colour, gloss: float) -> Material:
     m = material
-    return Material(colour, second, m.pattern, m.coarse, m.fine, gloss, parameters=m.parameters)
+    return Material(colour, second, m.pattern, m.coarse, m.fine, gloss, _RIPPLE, parameters=m.parameters)

@@ -12,6 +12,7 @@ from cvcdepth_core.worlds.description import (
     Bank,
     Drive,
     Ground,
+    Horizon,
     Line,
     Road,
     Sky,
@@ -66,6 +67,7 @@ class _Author:
             seed=self.seed,
             sky=sky,
             ground=self._ground(),
+            horizon=self._horizon(),
             roads=roads,
             drive=drive,
         )
@@ -179,7 +181,7 @@ class _Author:
             "slabs": "concrete",
         }
         pavement = dice.between(*kind.pavement) if kind.pavement[1] else 0.0
-        edges = (dice.between(*kind.edge), dice.between(*kind.edge))
+        edges = (self._edge(), self._edge())
         wide = dice.between(*kind.open_width) / 2 if not lanes else 0.0
         marked = surface in ("asphalt", "concrete")
         return Road(
@@ -205,6 +207,10 @@ class _Author:
             else (),
             banks=(self._bank(), self._bank()),
         )
+
+    def _edge(self) -> float:
+        dice = self.dice
+        return dice.between(2.0, 2.7) if dice.chance(self.kind.parking) else dice.between(*self.kind.edge)
 
     def _centre_line(self) -> Line:
         return self.dice.weighted({"dashed": 0.5, "solid": 0.15, "double": 0.25, "none": 0.1})
@@ -239,7 +245,24 @@ class _Author:
             first, second = (dice.natural(names.get(surface, "concrete")) for _ in range(2))
         waves = tuple(self._wave() for _ in range(dice.whole(1, 3))) if dice.chance(kind.hilly) else ()
         rough = dice.between(0.0, 0.6) if surface in ("grass", "dirt", "sand", "snow") else 0.0
-        return Ground(surface=surface, colour=first, second=second, waves=waves, rough=rough)
+        tall = dice.between(0.1, 1.0) if surface in ("grass", "dirt") and dice.chance(kind.tall_grass) else 0.0
+        return Ground(surface=surface, colour=first, second=second, waves=waves, rough=rough, tall=tall)
+
+    def _horizon(self) -> tuple[Horizon, ...]:
+        dice = self.dice
+        heights = {"hills": (10.0, 90.0), "woods": (8.0, 20.0), "town": (8.0, 40.0)}
+        far = {"hills": (220.0, 900.0), "woods": (110.0, 260.0), "town": (120.0, 350.0)}
+        return tuple(
+            Horizon(
+                kind=name,
+                distance=dice.scale(*far[name], digits=0),
+                height=dice.scale(*heights[name], digits=0),
+                colour=dice.natural("leaf" if name == "woods" else dice.pick("leaf", "grass", "dry_grass")),
+                seed=dice.seed(),
+            )
+            for name, chance in self.kind.horizon.items()
+            if dice.chance(chance)
+        )
 
     def _wave(self) -> Wave:
         dice = self.dice

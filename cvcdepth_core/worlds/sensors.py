@@ -109,5 +109,5 @@ def random_look(dice: Dice) -> CameraLook:
         blur=dice.between(0.0, 0.7),
         sharpening=max(0.0, dice.between(-0.5, 0.6)),
         noise=dice.scale(0.003, 0.035),
-        dirt=max(0.0, dice.between(-0.8, 0.4)),
+        dirt=max(0.0, dice.between(-1.2, 0.3)),
     )

@@ -76,6 +76,7 @@ def _places(scene: Scene, rays: Rays, hits: Hits, hit: Ints, directions: Floats,
 def _lit(scene: Scene, places: _Places, opened: Floats, sun_offsets: Floats, lamps: Lamps) -> Floats:
     """Light [3, N] that the surfaces scatter and send out themselves."""
     light, surface = scene.world.light, places.surface
+    opened = opened + surface.leafy * 0.35 * (1.0 - opened)
     open_share = opened / (1.0 - 0.7 * surface.colour.mean(axis=0) * (1.0 - opened))
     received = light.ambient(places.normals) * open_share
     if light.sunlight.any():
@@ -128,7 +129,7 @@ def _lamplight(lamps: Lamps, places: _Places) -> Floats:
 def _with_reflections(scene: Scene, places: _Places, lit: Floats, spread: Floats) -> Floats:
     gloss = places.surface.gloss
     cosine = np.abs((places.normals * places.directions).sum(axis=0))
-    share = gloss * (0.06 + 0.94 * np.clip(1.0 - cosine, 0.0, 1.0) ** 4)
+    share = gloss * (0.05 + 0.95 * np.clip(1.0 - cosine, 0.0, 1.0) ** 5)
     shiny = np.flatnonzero(share > _LEAST_REFLECTION)
     if len(shiny):
         mirrored = _mirrored(scene, places, shiny, spread)
@@ -140,6 +141,8 @@ def _mirrored(scene: Scene, places: _Places, shiny: Ints, spread: Floats) -> Flo
     """Return what the shiny places reflect: what stands around in plain light, and the sky."""
     light = scene.world.light
     incoming, normals = places.directions[:, shiny], places.normals[:, shiny]
+    ripple = places.surface.ripple[shiny]
+    normals = _unit(normals + np.stack([ripple, -0.6 * ripple, 0.0 * ripple]))
     outgoing = incoming - 2.0 * (incoming * normals).sum(axis=0) * normals
     flat = places.flat[:, shiny]
     # A smooth normal may send the ray into the face that it comes from.

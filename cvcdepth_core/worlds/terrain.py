@@ -10,6 +10,7 @@ import numpy as np
 
 from cvcdepth_core.worlds.description import Bank, Ground, Road
 from cvcdepth_core.worlds.meshes import Floats
+from cvcdepth_core.worlds.noise import Noise, noise
 from cvcdepth_core.worlds.paths import Path, eased
 
 _FADE = 7.0  # metres from another road, over which a bank is levelled
@@ -67,7 +68,16 @@ class Terrain:
         for number, corridor in enumerate(self.corridors):
             if any(corridor.road.banks):
                 z += self._banks(number, points)
-        return z
+        return z + self._roughness(points) if self.ground.rough else z
+
+    def _roughness(self, points: Floats) -> Floats:
+        """Small unevenness, which begins beside the roads."""
+        away = np.full(len(points), np.inf)
+        for corridor in self.corridors:
+            away = np.minimum(away, -corridor.depth(points))
+        x, y = points.T
+        value = noise(Noise.CLOUDY, 2.5 * x, 2.5 * y, np.full(len(points), 3.0))
+        return 0.3 * self.ground.rough * np.clip(away / 5.0, 0.0, 1.0) * value
 
     def at(self, x: float, y: float) -> float:
         """Return z at one place."""

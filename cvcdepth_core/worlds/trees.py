@@ -16,7 +16,7 @@ from cvcdepth_core.worlds.site import Site
 _VARIANTS = 4  # shapes of each kind of tree; size, turn and colour differ besides
 _BARK = (0.1, 0.08, 0.062)
 _WOOD, _LEAF = 0, 1  # materials of a template
-_NEAR, _FAR = 28.0, 70.0  # metres from a road: nearer trees have more and smaller leaves
+_NEAR, _FAR = 7.0, 25.0  # metres from a road: nearer trees have more and smaller leaves
 
 
 def build_trees(site: Site) -> None:
@@ -43,7 +43,7 @@ def _detail(site: Site, tree: Tree) -> int:
     """2 for trees beside the way, 1 behind, 0 far off."""
     x, y = site.xy(tree.at, tree.road)
     outside = min((-float(c.depth(np.array([[x, y]]))[0]) for c in site.corridors), default=0.0)
-    return 2 if outside < _NEAR / 3 else 1 if outside < _FAR / 2 else 0
+    return 2 if outside < _NEAR else 1 if outside < _FAR else 0
 
 
 def _trunk_stretched(mesh: Mesh, trunk: float) -> Mesh:
@@ -106,12 +106,12 @@ def _crown(rng: np.random.Generator, tips: Floats, detail: int, narrow: bool) ->
     """Clumps of leaves around the branches' tips, dark inside."""
     wide = 0.09 if narrow else 0.17
     clumps = []
-    count = (30, 60, 120)[detail]
+    count = (30, 60, 200)[detail]
     for tip in tips:
         centre = np.clip(tip, (-0.38, -0.38, 0.36), (0.38, 0.38, 0.9))
         radius = wide * rng.uniform(0.7, 1.15)
         flat = np.array([radius, radius, radius * rng.uniform(0.5, 0.8)])
-        clumps.append(_leaves(rng, centre, flat, count, 0.34 * radius * (1.0, 0.75, 0.55)[detail]))
+        clumps.append(_leaves(rng, centre, flat, count, 0.34 * radius * (1.0, 0.75, 0.42)[detail]))
         clumps.append(_core(rng, centre, 0.66 * flat, min(detail, 1)))
     return joined(clumps)
 
