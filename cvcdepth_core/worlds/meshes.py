@@ -229,14 +229,17 @@ def cylinder(
     return tube([(0, 0, bottom), (0, 0, bottom + height)], [radius, radius * taper], material, sides)
 
 
-def wheel(radius: float, width: float, tyre: int, rim: int, sides: int = 14) -> Mesh:
-    """Wheel about the y axis, centred at the origin."""
+def wheel(radius: float, width: float, tyre: int, rim: int, sides: int = 14, spokes: int | None = None) -> Mesh:
+    """Wheel about the y axis, centred at the origin; between its spokes is the material `spokes`."""
     shoulder = 0.16 * width
     across = [-width / 2, -width / 2 + shoulder, width / 2 - shoulder, width / 2]
     round_part = tube([(0, y, 0) for y in across], radius * np.array([0.9, 1, 1, 0.9]), tyre, sides)
-    hubs = [
-        tube([(0, y, 0), (0, y * 1.02, 0)], [0.62 * radius, 0.55 * radius], rim, 10) for y in (-width / 2, width / 2)
-    ]
+    hubs = []
+    for y in (-width / 2, width / 2):
+        hub = tube([(0, y, 0), (0, y * 1.02, 0)], [0.64 * radius, 0.2 * radius], rim, 10)
+        if spokes is not None:
+            hub.materials[:20:4] = hub.materials[1:20:4] = spokes
+        hubs.append(hub)
     return joined([round_part, *hubs])
 
 

@@ -33,7 +33,8 @@ def person_mesh(site: Site, person: Person) -> Mesh:
         return joined([*_motorcycle(make), *_rider(make, seat=0.82)])
     if person.kind == "pushchair":
         return joined([*_pushchair(make), *(part.moved(-0.75) for part in _walker(make, 1.68))])
-    return joined(_walker(make, 1.15 if person.kind == "child" else 1.74))
+    walker = joined(_walker(make, 1.74))
+    return walker.scaled(0.7, 0.74, 0.68) if person.kind == "child" else walker
 
 
 class _Make:

@@ -140,22 +140,22 @@ def _bush(rng: np.random.Generator, detail: int) -> Mesh:
     parts = []
     count = (50, 120, 260)[detail]
     for _ in range(6):
-        centre = np.array([*rng.uniform(-0.25, 0.25, 2), rng.uniform(0.3, 0.6)])
-        radii = rng.uniform(0.2, 0.32, 3)
+        centre = np.array([*rng.uniform(-0.28, 0.28, 2), rng.uniform(0.22, 0.62)])
+        radii = rng.uniform(0.2, 0.34, 3)
         parts += [_leaves(rng, centre, radii, count, 0.07 * (1.0, 0.8, 0.6)[detail]), _core(rng, centre, 0.8 * radii)]
     return joined(parts)
 
 
 def _conifer(rng: np.random.Generator, detail: int) -> Mesh:
     parts = [tube([(0, 0, 0), (0, 0, 0.95)], [0.022, 0.004], _WOOD, 6, closed=False)]
-    levels = (6, 9, 14)[detail]
+    levels = (8, 12, 18)[detail]
     for i in range(levels):
         z = 0.28 + 0.7 * (i + 0.3) / levels
         radius = 0.5 * (1.02 - z) / 0.75
-        count = max(4, round(11 * radius / 0.5))
+        count = max(4, round(13 * radius / 0.5))
         for k in range(count):
             angle = 2 * math.pi * (k + rng.uniform(0, 0.6)) / count
-            parts.append(_bough(rng, z, angle, radius * rng.uniform(0.75, 1.1), (5, 8, 14)[detail]))
+            parts.append(_bough(rng, z, angle, radius * rng.uniform(0.75, 1.1), (6, 9, 16)[detail]))
     return joined(parts)
 
 
@@ -164,7 +164,7 @@ def _bough(rng: np.random.Generator, z: float, angle: float, reach: float, count
     along = rng.uniform(0.1, 1.0, (count, 1))
     way = np.array([math.cos(angle), math.sin(angle), 0.0])
     places = way * along * reach + (0, 0, z) + np.c_[np.zeros((count, 2)), -0.16 * along * reach + 0.01]
-    spread = 0.05 + 0.13 * reach * (1.15 - along)
+    spread = 0.05 + 0.16 * reach * (1.15 - along)
     corners = places[:, None] + rng.normal(size=(count, 3, 3)) * spread[:, None] * (0.8, 0.8, 0.28)
     normal = np.array([0.6 * way[0], 0.6 * way[1], 0.75])
     normals = np.broadcast_to(normal / np.linalg.norm(normal), (count, 3, 3)).astype(np.float32)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -167,7 +168,7 @@ class _Station(NamedTuple):
         )
 
 
-_SKIRT, _SIDE, _WINDOW, _TOP = slice(0, 2), slice(2, 5), slice(5, 6), slice(6, 8)  # strips of the outline
+_SKIRT, _LAMP, _WINDOW, _TOP = slice(0, 2), slice(3, 5), slice(5, 6), slice(6, 8)  # strips of the outline
 
 
 def _body(make: _Make, shape: _Shape, kind: VehicleKind) -> Mesh:
@@ -196,7 +197,7 @@ def _stations(s: _Shape, kind: VehicleKind) -> list[_Station]:
     bonnet = 0.55 * belt + 0.45 * s.bonnet + 0.03
     along = [
         # share of the length, underside, belt, top, wide, belt wide, top wide
-        (0.0, s.clearance + 0.14, s.boot * 0.8, s.boot * 0.93, w - 0.13, w - 0.17, w * 0.7),
+        (0.0, s.clearance + 0.14, s.boot * 0.82, s.boot * 0.93, w - 0.12, w - 0.17, w * 0.7),
         (0.012, s.clearance + 0.06, s.boot * 0.94, s.boot, w - 0.06, w - 0.09, w * 0.76),
         (s.rear_window + 0.015, s.clearance, belt, max(belt, s.boot), w - 0.01, glass_wide, w * 0.8),
         (s.roof[0], s.clearance, belt, s.height - 0.03, w, glass_wide, roof_wide),
@@ -227,6 +228,10 @@ def _skin(make: _Make, s: _Shape, kind: VehicleKind, stations: list[_Station]) -
         middle = (first + last) / 2
         in_cabin = s.rear_window + 0.01 < middle < s.cowl
         pillar = last - first < 0.03 and s.roof[0] < middle < s.roof[1]
+        if 0.96 < middle < 0.992:
+            row[_LAMP] = make.head
+        elif middle < 0.008:
+            row[_LAMP] = make.tail
         if in_cabin and not pillar and middle > s.windows_to:
             row[_WINDOW] = make.glass
         windscreen = s.roof[1] < middle < s.cowl
@@ -251,25 +256,25 @@ def _wheels(make: _Make, s: _Shape) -> Iterator[Mesh]:
         x = share * s.length - s.length / 2
         for side in (-1.0, 1.0):
             y = side * (s.width / 2 - _TYRE_WIDTH / 2 + 0.015)
-            yield wheel(r, _TYRE_WIDTH, make.tyre, make.rim).moved(x, y, r)
-            # The dark of the wheel arch.
-            arch_y = side * (s.width / 2 - 0.01)
-            arch = tube(
-                [(x, arch_y - side * 0.25, r + 0.03), (x, arch_y + side * 0.004, r + 0.03)],
-                [r * 1.18] * 2,
-                make.black,
-                16,
-            )
-            yield arch
+            yield wheel(r, _TYRE_WIDTH, make.tyre, make.rim, spokes=make.black).moved(x, y, r)
+            yield _arch(x, side * (s.width / 2 + 0.004), r + 0.02, 1.17 * r, make.black)
+
+
+def _arch(x: float, y: float, z: float, radius: float, material: int) -> Mesh:
+    """Return the dark of a wheel arch: the upper half of a disc in a plane of constant y."""
+    angles = np.linspace(-0.15, math.pi + 0.15, 13)
+    ring = np.stack([x + radius * np.cos(angles), np.full(13, y), z + radius * np.sin(angles)], axis=1)
+    i = np.arange(12)
+    order = (i, i + 1) if y < 0 else (i + 1, i)
+    return flat_mesh(np.r_[ring, [[x, y, z]]], np.c_[order[0], order[1], np.full(12, 13)], material)
 
 
 def _lights(make: _Make, s: _Shape) -> Iterator[Mesh]:
+    """Yield the third brake light and the fog lights; the others are painted on the body."""
     f, w = s.length / 2, s.width / 2
+    yield box(0.04, 0.4, 0.03, make.tail, 0).moved(-f + 0.02, 0, s.boot * 0.95)
     for side in (-1.0, 1.0):
-        yield box(0.3, 0.34, 0.13, make.head, -0.065, (0.6, 0.8)).moved(f - 0.2, side * (w - 0.3), s.bonnet * 0.84)
-        yield box(0.2, 0.26, 0.2, make.tail, -0.1, (0.7, 0.9)).moved(-f + 0.1, side * (w - 0.24), s.boot * 0.83)
-    third = box(0.04, 0.4, 0.03, make.tail, 0).moved(-f + 0.02, 0, s.boot * 0.95)
-    yield third
+        yield box(0.05, 0.14, 0.07, make.head, 0).moved(f - 0.06, side * (w - 0.36), s.clearance + 0.2)
 
 
 def _trims(make: _Make, s: _Shape, kind: VehicleKind) -> Iterator[Mesh]:
