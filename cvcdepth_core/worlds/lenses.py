@@ -27,13 +27,13 @@ class Lens:
         self._calibration = calibration
         self._rectified = rectified
         self._rays: dict[int, Floats] = {}
-        self.centre_rays = self.rays(1)
+        self.centre_rays = self._sampled_rays(1)
         """Unit vectors [3, H, W] float64 through the pixels' centres."""
 
     def rays(self, samples: int) -> Floats:
-        """Return unit vectors [3, H samples, W samples] float64: `samples` x `samples` of them through each pixel."""
+        """Return unit vectors [3, H samples, W samples] float32: `samples` x `samples` of them through each pixel."""
         if samples not in self._rays:
-            self._rays[samples] = self._sampled_rays(samples)
+            self._rays[samples] = self._sampled_rays(samples).astype(np.float32)
         return self._rays[samples]
 
     def _sampled_rays(self, samples: int) -> Floats:

@@ -95,7 +95,8 @@ class Material:
 
 
 _PARAMETERS = 10
-_COLUMNS = 22 + _PARAMETERS
+_COMMON = 22  # columns that every pattern has; the parameters follow
+_COLUMNS = _COMMON + _PARAMETERS
 
 
 class MaterialTable:
@@ -152,7 +153,7 @@ class _Place(NamedTuple):
     fine: Floats
 
     def parameter(self, number: int) -> Floats:
-        return self.rows[22 + number]
+        return self.rows[_COMMON + number]
 
     def sharpness(self, size: Floats | float) -> Floats:
         """1 where details of this size (metres) can be seen, 0 where they are far below a pixel."""
@@ -161,7 +162,8 @@ class _Place(NamedTuple):
 
 def evaluate(table: Floats, materials: Ints, u: Floats, v: Floats, footprint: Floats) -> Surface:
     """Colours and more at the texture coordinates u, v [N], seen with pixels `footprint` [N] wide, all in metres."""
-    rows = np.ascontiguousarray(table.take(materials, axis=0).T)
+    columns = np.ascontiguousarray(table.T)
+    rows = columns[:_COMMON].take(materials, axis=1)
     coarse = _layer(rows, 7, u, v, footprint)
     fine = _layer(rows, 10, u, v, footprint)
     shade = np.clip(1.0 + coarse + fine, 0.15, 2.2)
@@ -173,7 +175,8 @@ def evaluate(table: Floats, materials: Ints, u: Floats, v: Floats, footprint: Fl
     for number, apply in _PATTERNS.items():
         chosen = np.flatnonzero(pattern == number)
         if len(chosen):
-            apply(surface, chosen, _Place(rows[:, chosen], *(values[chosen] for values in place[1:])))
+            own = columns.take(materials[chosen], axis=1)
+            apply(surface, chosen, _Place(own, *(values.take(chosen) for values in place[1:])))
     np.clip(surface.colour, 0.0, 0.95, out=surface.colour)
     return surface
 
@@ -203,7 +206,7 @@ def _brick(surface: Surface, chosen: Ints, place: _Place) -> None:
     surface.colour[:, chosen] = _brick_colour(place, surface.colour[:, chosen], place.parameter(0), place.parameter(1))
 
 
-def _brick_colour(place: _Place, colour: Floats, length: Floats, height: Floats) -> Floats:
+def _brick_colour(place: _Place, colour: Floats, length: Floats | np.float32, height: Floats | np.float32) -> Floats:
     row = np.floor(place.v / height)
     along = place.u / length + 0.5 * np.mod(row, 2.0)
     joint = np.float32(0.011)
@@ -227,14 +230,10 @@ def _planks(surface: Surface, chosen: Ints, place: _Place) -> None:
     surface.colour[:, chosen] *= _plank_shade(place, width, upright)
 
 
-def _plank_shade(place: _Place, width: Floats, upright: Floats) -> Floats:
+def _plank_shade(place: _Place, width: Floats | np.float32, upright: Floats | np.float32) -> Floats:
     across = np.where(upright > 0.5, place.u, place.v) / width
     gap = _lines(across, np.float32(0.012) / width) * place.sharpness(0.02)
     return (1.0 + 0.3 * (_hash(np.floor(across), 0.0 * across) - 0.5) * place.sharpness(width)) * (1.0 - 0.65 * gap)
-
-
-def _corrugated_shade(place: _Place) -> Floats:
-    return 1.0 + 0.28 * np.sin(place.u * np.float32(2 * np.pi / 0.22)) * place.sharpness(0.11)
 
 
 def _marking(surface: Surface, chosen: Ints, place: _Place) -> None:
@@ -344,20 +343,37 @@ def _opening(kind: Floats, f: FacadeParameters, random: Floats) -> _Opening:
 
 
 def _wall_colour(place: _Place, colour: Floats, f: FacadeParameters) -> Floats:
-    wall = np.asarray(f.wall)
     streaks = noise(Noise.STREAKS, place.u * 30.0, place.v * 9.0 + place.rows[16], place.footprint * 30.0)
     colour = colour * (1.0 + 0.05 * streaks)
-    bricks = _brick_colour(
-        place._replace(rows=np.concatenate([place.rows[:4], 0.75 * place.rows[1:4] + 0.12, place.rows[7:]])),
-        colour,
-        np.full_like(place.u, 0.24),
-        np.full_like(place.u, 0.077),
-    )
-    panel = _lines(place.u / f.bay, 0.02 / f.bay) | _lines((place.v - f.ground_height) / f.storey, 0.02 / f.storey)
-    panels = colour * (1.0 - 0.35 * panel * place.sharpness(0.03))
-    boards = colour * _plank_shade(place, np.full_like(place.u, 0.16), np.zeros_like(place.u))
-    metal = colour * _corrugated_shade(place)
-    return np.select([wall == 1.0, wall == 2.0, wall == 3.0, wall == 4.0], [bricks, panels, boards, metal], colour)
+    for number, shade in _WALLS.items():
+        chosen = np.flatnonzero(np.asarray(f.wall) == number)
+        if len(chosen):
+            part = _Place(place.rows.take(chosen, axis=1), *(values.take(chosen) for values in place[1:]))
+            colour[:, chosen] = shade(part, colour.take(chosen, axis=1))
+    return colour
+
+
+def _brick_wall(place: _Place, colour: Floats) -> Floats:
+    mortar = 0.75 * place.rows[1:4] + 0.12
+    rows = np.concatenate([place.rows[:4], mortar, place.rows[7:]])
+    return _brick_colour(place._replace(rows=rows), colour, np.float32(0.24), np.float32(0.077))
+
+
+def _panel_wall(place: _Place, colour: Floats) -> Floats:
+    storey, bay, ground = place.parameter(0), place.parameter(1), place.parameter(5)
+    joint = _lines(place.u / bay, 0.02 / bay) | _lines((place.v - ground) / storey, 0.02 / storey)
+    return colour * (1.0 - 0.35 * joint * place.sharpness(0.03))
+
+
+def _board_wall(place: _Place, colour: Floats) -> Floats:
+    return colour * _plank_shade(place, np.float32(0.16), np.float32(0.0))
+
+
+def _metal_wall(place: _Place, colour: Floats) -> Floats:
+    return colour * (1.0 + 0.28 * np.sin(place.u * np.float32(2 * np.pi / 0.22)) * place.sharpness(0.11))
+
+
+_WALLS = {1.0: _brick_wall, 2.0: _panel_wall, 3.0: _board_wall, 4.0: _metal_wall}
 
 
 def _lines(position: Floats, width: Floats) -> Floats:

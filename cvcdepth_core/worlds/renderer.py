@@ -97,11 +97,12 @@ class Renderer:
         n = self._samples
         rows = slice(band.rows.start * n, band.rows.stop * n)
         poses = np.repeat(self._way.poses(band.times) @ base_T_camera, n if len(band.times) > 1 else 1, axis=0)
-        rays = _rays(lens.rays(n)[:, rows], poses)
+        rays = _rays(lens.rays(n)[:, rows], poses.astype(np.float32))
         spread = _finer(lens.pixel_angles[band.rows] / n, n).astype(np.float32)
         light = shade(self.scene, rays, spread, _finer(opened, n), lens.width * n)
-        averaged = light.reshape(3, len(opened), n, lens.width, n).mean(axis=(2, 4))
-        return np.ascontiguousarray(np.moveaxis(averaged, 0, -1), np.float32)
+        samples = light.reshape(3, len(opened), n, lens.width, n)
+        total = sum(samples[:, :, dy, :, dx] for dy in range(n) for dx in range(n))
+        return np.ascontiguousarray(np.moveaxis(total, 0, -1), np.float32) / np.float32(n * n)
 
 
 class _Band(NamedTuple):
@@ -142,5 +143,5 @@ def _rays(camera_rays: Floats, world_T_camera: Floats) -> Rays:
     R = world_T_camera[:, None, :3, :3]
     ways = [R[..., i, 0] * x + R[..., i, 1] * y + R[..., i, 2] * z for i in range(3)]
     directions = np.stack(ways, axis=-1)
-    origins = world_T_camera[:, None, :3, 3] + _NEAR * directions
+    origins = world_T_camera[:, None, :3, 3] + directions.dtype.type(_NEAR) * directions
     return Rays(origins.reshape(-1, 3), directions.reshape(-1, 3))

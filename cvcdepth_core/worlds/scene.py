@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cvcdepth_core.rig.poses import Pose
-from cvcdepth_core.worlds.meshes import Floats, Ints, Mesh, face_normals, joined
+from cvcdepth_core.worlds.meshes import Floats, Ints, Mesh, joined
 from cvcdepth_core.worlds.ray_engine import Hits, TriangleScene
 from cvcdepth_core.worlds.world import OWN_VEHICLE, World
 
@@ -26,33 +26,44 @@ class Rays(NamedTuple):
 
 
 class _Faces:
-    """Properties of all faces by number; those of what moves are at the end and are written anew at every moment."""
+    """Properties of all faces by number; those of what moves are at the end, and where they are is written anew."""
 
-    def __init__(self, mesh: Mesh, objects: Ints, moving_faces: int) -> None:
-        count = len(mesh.faces) + moving_faces
+    def __init__(self, mesh: Mesh, objects: Ints, still: int) -> None:
+        count = len(mesh.faces)
         self.plane = np.zeros((count, 4))
-        self.normals = np.zeros((count, 9), np.float32)
-        self.uv = np.zeros((count, 6), np.float32)
-        self.materials = np.zeros(count, np.int32)
-        self.objects = np.zeros(count, np.int32)
+        self.normals = np.zeros((9, count), np.float32)
+        self.uv = np.ascontiguousarray(_differences(mesh.uv).T, np.float32)
+        self.materials = mesh.materials.astype(np.int32)
+        self.objects = objects.astype(np.int32)
         self.moving = np.zeros(count, bool)
-        self.write(0, mesh, objects, np.zeros(len(mesh.faces), bool))
+        vertices = mesh.vertices.astype(np.float32)[mesh.faces[:still]]
+        self.write(np.arange(still), vertices, mesh.normals[:still])
 
-    def write(self, start: int, mesh: Mesh, objects: Ints, moving: Floats) -> Floats:
-        """Fill in a mesh from face `start` on; return its corners [F, 3, 3] float32 as rays meet them."""
-        stop = start + len(mesh.faces)
-        vertices = mesh.vertices.astype(np.float32)
-        exact = vertices.astype(np.float64)
-        flat = face_normals(exact, mesh.faces)
-        self.plane[start:stop, :3] = flat
-        self.plane[start:stop, 3] = np.einsum("fi,fi->f", flat, exact[mesh.faces[:, 0]])
+    def write(self, numbers: Ints, corners: Floats, normals: Floats) -> None:
+        """Say where faces are: `corners` [F, 3, 3] float32 as rays meet them, `normals` as a `Mesh` has them."""
+        exact = corners.astype(np.float64)
+        flat = np.cross(exact[:, 1] - exact[:, 0], exact[:, 2] - exact[:, 0])
+        length = np.linalg.norm(flat, axis=1, keepdims=True)
+        flat /= np.where(length > 0, length, 1.0)
+        self.plane[numbers, :3] = flat
+        self.plane[numbers, 3] = np.einsum("fi,fi->f", flat, exact[:, 0])
         # Corner normals as one and two differences, as barycentric weights are applied.
-        corner = np.where(np.any(mesh.normals, axis=2, keepdims=True), mesh.normals, flat[:, None]).astype(np.float32)
-        self.normals[start:stop] = _differences(corner)
-        self.uv[start:stop] = _differences(mesh.uv)
-        self.materials[start:stop], self.objects[start:stop] = mesh.materials, objects
-        self.moving[start:stop] = moving
-        return vertices[mesh.faces]
+        given = (normals != 0).any(axis=(1, 2))[:, None, None]
+        self.normals[:, numbers] = _differences(np.where(given, normals, flat[:, None]).astype(np.float32)).T
+
+
+class _Movers:
+    """All that moves, with each vertex's and face's mover; the vehicle that carries the sensors is the last."""
+
+    def __init__(self, world: World, vehicle: Mesh | None) -> None:
+        meshes = [mover.mesh for mover in world.movers] + ([vehicle] if vehicle is not None else [])
+        self.ways = [mover.way for mover in world.movers]
+        self.mesh = joined(meshes)
+        self.objects = np.array([*(mover.number for mover in world.movers), *([OWN_VEHICLE] if vehicle else [])], np.int32)
+        count = np.arange(len(meshes))
+        self.of_vertex = np.repeat(count, [len(mesh.vertices) for mesh in meshes])
+        self.of_face = np.repeat(count, [len(mesh.faces) for mesh in meshes])
+        self.face_objects = self.objects[self.of_face] if len(meshes) else np.zeros(0, np.int32)
 
 
 def _differences(corners: Floats) -> Floats:
@@ -67,26 +78,33 @@ class Scene:
     def __init__(self, world: World, vehicle: Mesh | None = None) -> None:
         """`vehicle` is the body of the vehicle that carries the sensors, in its base frame."""
         self.world = world
-        self._vehicle = vehicle
-        moving_faces = sum(len(mover.mesh.faces) for mover in world.movers)
-        moving_faces += len(vehicle.faces) if vehicle is not None else 0
-        self.faces = _Faces(world.mesh, world.objects, moving_faces)
-        self._first_moving = len(world.mesh.faces)
+        self._movers = _Movers(world, vehicle)
+        self._still_faces = len(world.mesh.faces)
+        whole = joined([world.mesh, self._movers.mesh])
+        self.faces = _Faces(whole, np.concatenate([world.objects, self._movers.face_objects]), self._still_faces)
         self._still = TriangleScene(world.mesh.vertices.astype(np.float32)[world.mesh.faces])
         self._moving = TriangleScene(np.zeros((0, 3, 3), np.float32))
+        self._near = np.zeros(0, np.int32)
         self._moment: tuple[float, bytes] | None = None
 
     def set_moment(self, time: float, world_T_base: Pose, speed: float = 0.0) -> None:
         """Put everything that moves where it is at a time (seconds), the sensors' vehicle at `world_T_base`."""
         moment = (time, world_T_base.tobytes())
-        if moment == self._moment:
+        if moment == self._moment or not len(self._movers.objects):
             return
         self._moment = moment
-        meshes, objects, moving = self._moved(time, world_T_base, speed)
-        mesh = joined(meshes)
-        numbers = np.repeat(objects, [len(m.faces) for m in meshes]).astype(np.int32)
-        flags = np.repeat(moving, [len(m.faces) for m in meshes]).astype(bool)
-        corners = self.faces.write(self._first_moving, mesh, numbers, flags)
+        movers = self._movers
+        poses = np.stack([*(way.pose(time) for way in movers.ways), world_T_base])[: len(movers.objects)]
+        speeds = np.array([*(way.speed(time) for way in movers.ways), speed])[: len(movers.objects)]
+        near = np.linalg.norm(poses[:, :3, 3] - world_T_base[:3, 3], axis=1) < _MOVER_REACH
+        chosen = np.flatnonzero(near[movers.of_face])
+        of_vertex, of_face = movers.of_vertex, movers.of_face[chosen]
+        vertices = np.einsum("vij,vj->vi", poses[of_vertex, :3, :3], movers.mesh.vertices) + poses[of_vertex, :3, 3]
+        corners = vertices.astype(np.float32)[movers.mesh.faces[chosen]]
+        normals = np.einsum("fij,fcj->fci", poses[of_face, :3, :3], movers.mesh.normals[chosen])
+        self._near = chosen + self._still_faces
+        self.faces.write(self._near, corners, normals)
+        self.faces.moving[self._near] = np.abs(speeds[of_face]) > _STANDING
         self._moving = TriangleScene(corners)
 
     def nearest(self, rays: Rays) -> Hits:
@@ -97,7 +115,8 @@ class Scene:
         nearer = (moving.faces >= 0) & (moving.distances < still.distances)
         if not nearer.any():
             return still
-        pairs = zip(moving._replace(faces=moving.faces + self._first_moving), still, strict=True)
+        numbered = moving._replace(faces=self._near[np.maximum(moving.faces, 0)])
+        pairs = zip(numbered, still, strict=True)
         return Hits(*(np.where(nearer, a, b) for a, b in pairs))
 
     def exact_distances(self, rays: Rays, hits: Hits) -> Floats:
@@ -119,21 +138,6 @@ class Scene:
         open_ones = np.flatnonzero(~blocked)
         blocked[open_ones] = self._moving.blocked(origins[open_ones], directions[open_ones], reach[open_ones])
         return blocked
-
-    def _moved(self, time: float, world_T_base: Pose, speed: float) -> tuple[list[Mesh], list[int], list[bool]]:
-        meshes, objects, moving = [], [], []
-        for mover in self.world.movers:
-            pose = mover.way.pose(time)
-            if np.linalg.norm(pose[:3, 3] - world_T_base[:3, 3]) < _MOVER_REACH:
-                meshes.append(mover.mesh.transformed(pose[:3, :3], pose[:3, 3].tolist()))
-                objects.append(mover.number)
-                moving.append(abs(mover.way.speed(time)) > _STANDING)
-        if self._vehicle is not None:
-            meshes.append(self._vehicle.transformed(world_T_base[:3, :3], world_T_base[:3, 3].tolist()))
-            objects.append(OWN_VEHICLE)
-            moving.append(abs(speed) > _STANDING)
-        return meshes, objects, moving
-
 
 def _single(values: Floats) -> Floats:
     return np.ascontiguousarray(values, np.float32)

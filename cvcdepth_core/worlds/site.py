@@ -55,6 +55,22 @@ class Site:
         place = self.place(placed)
         self.add(self.new_object(name), mesh.turned(place.yaw).moved(place.x, place.y, place.z - sink))
 
+    def park(self, name: str, mesh: Mesh, placed: Placed) -> None:
+        """Stand a vehicle on the ground as its wheels would."""
+        place = self.place(placed)
+        forward = np.array([math.cos(place.yaw), math.sin(place.yaw)])
+        left = np.array([-forward[1], forward[0]])
+        half = np.ptp(mesh.vertices[:, 0]) * 0.3, np.ptp(mesh.vertices[:, 1]) * 0.4
+        wheels = np.array([place[:2] + a * half[0] * forward + b * half[1] * left for a in (1, -1) for b in (1, -1)])
+        fl, fr, rl, rr = (self.terrain.height(wheels) + self.raised(wheels)).tolist()
+        ahead = np.array([*forward, (fl + fr - rl - rr) / (4 * half[0])])
+        aside = np.array([*left, (fl + rl - fr - rr) / (4 * half[1])])
+        ahead /= np.linalg.norm(ahead)
+        aside -= ahead * (ahead @ aside)
+        aside /= np.linalg.norm(aside)
+        rotation = np.stack([ahead, aside, np.cross(ahead, aside)], axis=1)
+        self.add(self.new_object(name), mesh.transformed(rotation, (place.x, place.y, (fl + fr + rl + rr) / 4)))
+
     def place(self, placed: Placed) -> Place:
         """Where a part stands."""
         (x, y), yaw = self.xy(placed.at, placed.road), math.radians(placed.yaw)

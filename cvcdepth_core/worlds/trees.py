@@ -106,13 +106,13 @@ def _crown(rng: np.random.Generator, tips: Floats, detail: int, narrow: bool) ->
     """Clumps of leaves around the branches' tips, dark inside."""
     wide = 0.09 if narrow else 0.17
     clumps = []
-    count = (30, 60, 200)[detail]
+    count = (24, 45, 110)[detail]
     for tip in tips:
         centre = np.clip(tip, (-0.38, -0.38, 0.36), (0.38, 0.38, 0.9))
         radius = wide * rng.uniform(0.7, 1.15)
         flat = np.array([radius, radius, radius * rng.uniform(0.5, 0.8)])
-        clumps.append(_leaves(rng, centre, flat, count, 0.34 * radius * (1.0, 0.75, 0.42)[detail]))
-        clumps.append(_core(rng, centre, 0.66 * flat, min(detail, 1)))
+        clumps.append(_leaves(rng, centre, flat, count, 0.34 * radius * (1.1, 0.85, 0.55)[detail]))
+        clumps.append(_core(rng, centre, 0.66 * flat, max(detail - 1, 0)))
     return joined(clumps)
 
 
@@ -138,11 +138,12 @@ def _core(rng: np.random.Generator, centre: Floats, radii: Floats, subdivisions:
 
 def _bush(rng: np.random.Generator, detail: int) -> Mesh:
     parts = []
-    count = (50, 120, 260)[detail]
+    count = (30, 70, 150)[detail]
     for _ in range(6):
         centre = np.array([*rng.uniform(-0.28, 0.28, 2), rng.uniform(0.22, 0.62)])
         radii = rng.uniform(0.2, 0.34, 3)
-        parts += [_leaves(rng, centre, radii, count, 0.07 * (1.0, 0.8, 0.6)[detail]), _core(rng, centre, 0.8 * radii)]
+        parts.append(_leaves(rng, centre, radii, count, 0.07 * (1.0, 0.8, 0.6)[detail]))
+        parts.append(_core(rng, centre, 0.8 * radii, max(detail - 1, 0)))
     return joined(parts)
 
 

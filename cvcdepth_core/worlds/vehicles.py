@@ -72,7 +72,7 @@ def build_vehicles(site: Site) -> None:
     """Add all vehicles that stand still; those that move are `vehicle_mesh` alone."""
     for vehicle in site.spec.vehicles:
         if vehicle.motion is None:
-            site.stand(vehicle.kind, vehicle_mesh(site, vehicle), vehicle)
+            site.park(vehicle.kind, vehicle_mesh(site, vehicle), vehicle)
 
 
 def vehicle_mesh(site: Site, vehicle: Vehicle) -> Mesh:

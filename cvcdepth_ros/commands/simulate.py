@@ -20,7 +20,8 @@ OUT becomes a rosbag2 folder (mcap) with every camera's pictures and camera_info
 the truth: /camera/NAME/truth/depth (32FC1, metres along the optical axis of the raw picture's pixels, inf for the sky).
 Beside it lie the rig file, the world file, which can be edited and simulated again, and simulation.json with all
 choices. The same choices give the same bytes, with any number of workers; an interrupted run goes on where it was.
-Needs embreex: pip install 'cvcdepth_ros[worlds]'."""
+With --many N, OUT becomes a folder of N short drives, one file each for training, every one with a rig and world of its
+own (--rig random, --world random or a kind of place). Needs embreex: pip install 'cvcdepth_ros[worlds]'."""
 EXAMPLES: tuple[str, ...] = (
     "simulate -o drive",
     "simulate --rig nuscenes --world city --seed 7 --seconds 10 --size 640x384 -o drive",
@@ -62,7 +63,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--look", choices=("clean", "varied"), default="varied", help="ideal cameras or real ones [varied]"
     )
     parser.add_argument("--odometry", choices=("exact", "wheels"), default="exact", help="true, or with errors [exact]")
-    parser.add_argument("--body", choices=("none", "car", "van", "robot"), default="none", help="body in view [none]")
+    parser.add_argument(
+        "--body", choices=("none", "car", "van", "robot", "varied"), help="own body in view [none; of many: varied]"
+    )
     parser.add_argument(
         "--stagger", type=_share, metavar="X", help="share of a period in which cameras fire in turn [0.6]"
     )
@@ -72,6 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--samples", type=int, choices=(1, 2, 3, 4), default=2, help="rays per pixel along each axis [2]"
     )
+    parser.add_argument("--many", type=_whole, metavar="N", help="shards for training instead of a recording")
     parser.add_argument("--workers", type=_whole, default=0, metavar="N", help="processes [one for each processor]")
     add_quiet(parser)
     add_json(parser)
@@ -84,12 +88,46 @@ def execute(arguments: argparse.Namespace) -> None:
     from cvcdepth_ros.simulation.set_messages import Form
 
     require_engine()
-    spec = _spec(arguments)
     workers = arguments.workers or len(os.sched_getaffinity(0))
+    if arguments.many:
+        _simulate_many(arguments, workers)
+        return
+    spec = _spec(arguments)
     form = Form(arguments.images, arguments.quality, arguments.truth)
     with _progress(spec.sets, "sets", arguments.quiet) as progress:
         result = record(spec, form, arguments.output, workers, progress)
     print_result({"output": str(arguments.output), **result}, _text(arguments.output, result), arguments.json)
+
+
+def _simulate_many(arguments: argparse.Namespace, workers: int) -> None:
+    from cvcdepth_ros.simulation.many import ManyDrives, simulate_many
+
+    for option in ("sensors", "no_lidar"):
+        if getattr(arguments, option):
+            arguments.usage_error(f"argument --{option.replace('_', '-')}: not with --many")
+    if arguments.images == "raw":
+        arguments.usage_error("argument --images: shards hold jpeg or png")
+    choices = ManyDrives(
+        arguments.many,
+        arguments.rig,
+        arguments.world,
+        arguments.size,
+        arguments.seed,
+        arguments.seconds,
+        arguments.rate or 10.0,
+        arguments.samples,
+        arguments.look,
+        arguments.odometry,
+        arguments.body or "varied",
+        arguments.stagger,
+        arguments.readout or 0.0,
+        arguments.images,
+        arguments.quality,
+    )
+    with _progress(arguments.many, "drives", arguments.quiet) as progress:
+        recipe = simulate_many(choices, arguments.output, workers, progress)
+    result = {"output": str(arguments.output), **recipe}
+    print_result(result, f"{arguments.many} drives in {arguments.output}", arguments.json)
 
 
 def _spec(arguments: argparse.Namespace) -> "DriveSpec":
@@ -118,7 +156,9 @@ def _sensors(arguments: argparse.Namespace, cameras: int) -> "Sensors":
         sensors = chosen_sensors(cameras, arguments.look, arguments.odometry, arguments.seed)
     given = {name: getattr(arguments, name) for name in ("rate", "stagger", "readout")}
     changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    changes |= {"body": arguments.body} if arguments.body != "none" else {}
+    if arguments.body == "varied":
+        arguments.usage_error("argument --body: varied is for --many")
+    changes |= {"body": arguments.body} if arguments.body else {}
     changes |= {"lidar": None} if arguments.no_lidar else {}
     return Sensors.model_validate(sensors.model_dump() | changes)
 
