@@ -13,6 +13,9 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 
+_FASTEST = 60  # m/s
+
+
 class Part(BaseModel):
     """Immutable; unknown keys are refused."""
 
@@ -25,7 +28,17 @@ def _reflectance(colour: tuple[float, float, float]) -> tuple[float, float, floa
     return colour
 
 
+def _increasing(speeds: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+    times = [time for time, _ in speeds]
+    if not times or times != sorted(set(times)):
+        raise ValueError(f"speeds: times {times} do not increase")
+    if any(abs(speed) > _FASTEST for _, speed in speeds):
+        raise ValueError(f"speeds: {speeds}: nothing moves faster than {_FASTEST} m/s")
+    return speeds
+
+
 Colour = Annotated[tuple[float, float, float], AfterValidator(_reflectance)]
+Speeds = Annotated[tuple[tuple[float, float], ...], AfterValidator(_increasing)]
 Point = tuple[float, float]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Length = Annotated[float, Field(gt=0.0, le=2000.0)]
@@ -260,19 +273,11 @@ class Structure(Placed):
 class Motion(Part):
     """How a road user moves; by default along its road, at its own distance from the middle."""
 
-    speeds: tuple[tuple[float, float], ...] = ((0.0, 8.0),)
+    speeds: Speeds = ((0.0, 8.0),)
     """Time and speed; in between the speed changes evenly, before and after it stays."""
     bends: tuple[Point, ...] | None = None
     """Length and curvature of each piece of its own way."""
 
-    @model_validator(mode="after")
-    def _check(self) -> Motion:
-        times = [time for time, _ in self.speeds]
-        if not times or times != sorted(set(times)):
-            raise ValueError(f"speeds: times {times} do not increase")
-        if any(abs(speed) > 60 for _, speed in self.speeds):
-            raise ValueError("speeds: nothing drives faster than 60 m/s here")
-        return self
 
 
 class Vehicle(Placed):
@@ -299,7 +304,7 @@ class Person(Placed):
 class Drive(Placed):
     """How the vehicle that carries the sensors drives through this world."""
 
-    speeds: tuple[tuple[float, float], ...] = ((0.0, 8.0),)
+    speeds: Speeds = ((0.0, 8.0),)
     """As for `Motion`; negative speeds drive backwards."""
     bends: tuple[Point, ...] | None = None
     """Its own way; without it, along its road at its own distance from the middle."""

@@ -245,7 +245,7 @@ def _pallets(m: _Make) -> Iterator[Mesh]:
 
 def _skip(m: _Make) -> Iterator[Mesh]:
     skin = m.add(plain(m.bright(), 1.5))
-    yield box(2.6, 1.6, m.h, skin, 0.1, (1.35, 1.1))
+    yield box(2.6, 1.6, m.h, skin, 0.0, (1.35, 1.1))
 
 
 def _parasol(m: _Make) -> Iterator[Mesh]:

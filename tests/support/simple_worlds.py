@@ -6,10 +6,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from cvcdepth_core.rig.calibration import Calibration
+from cvcdepth_core.rig.rig import CameraEntry, PoseEntry, RigLayout
+from cvcdepth_core.worlds.description import Building, Drive, Ground, Motion, Road, Sky, Tree, Vehicle, Wave, WorldSpec
+from cvcdepth_core.worlds.drive import DriveSpec
 from cvcdepth_core.worlds.light import Lamps, Light
 from cvcdepth_core.worlds.materials import Layer, Material, MaterialTable
 from cvcdepth_core.worlds.meshes import Mesh, joined
 from cvcdepth_core.worlds.noise import Noise
+from cvcdepth_core.worlds.sensors import Lidar, Sensors
 from cvcdepth_core.worlds.world import Mover, World
 
 FORWARD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -68,3 +72,54 @@ def simple_world(meshes: Sequence[Mesh], table: MaterialTable, movers: Sequence[
     numbers = np.repeat(np.arange(len(meshes)) + 2, [len(mesh.faces) for mesh in meshes]).astype(np.int32)
     names = ("sky", "own vehicle", *(f"object {i}" for i in range(len(meshes) + len(movers))))
     return World(joined(meshes), numbers, names, tuple(movers), table.array(), daylight())
+
+
+def street_spec(**changes: object) -> WorldSpec:
+    """A short street that is built in a moment: houses, a tree, a parked and a moving car."""
+    houses = tuple(
+        Building(at=(5.0 + 16 * i, side * 10.0), yaw=90 - side * 90, size=(13, 8, 7), wall=wall, seed=i)
+        for i, wall in enumerate(("plaster", "brick", "panels"))
+        for side in (-1, 1)
+    )
+    spec = WorldSpec(
+        name="street",
+        seed=5,
+        sky=Sky(weather="cloudy"),
+        ground=Ground(margin=20.0, waves=(Wave(height=0.3, wavelength=80.0),)),
+        roads=(Road(start=(-20.0, 0.0, 0.0), bends=((80.0, 0.0),), pavement=(2.0, 2.0)),),
+        buildings=houses,
+        trees=(Tree(at=(30.0, 5.0)),),
+        vehicles=(
+            Vehicle(at=(34.0, -2.6)),
+            Vehicle(at=(38.0, 1.6), yaw=180.0, motion=Motion(speeds=((0.0, 6.0),))),
+        ),
+        drive=Drive(at=(20.0, -1.6), speeds=((0.0, 5.0), (2.0, 7.0))),
+    )
+    return spec.model_copy(update=changes)
+
+
+def two_cameras(**changes: object) -> RigLayout:
+    """A rig of two pinhole cameras of 64 x 40 pixels that overlap."""
+    entries = []
+    for name, yaw in (("front", 0.0), ("left", 60.0)):
+        c, s = np.cos(np.radians(yaw)), np.sin(np.radians(yaw))
+        pose = np.eye(4)
+        pose[:3, :3] = [[s, 0, c], [-c, 0, s], [0, -1, 0]]
+        pose[:3, 3] = 1.2 * c, 0.5 * s, 1.6
+        entries.append(
+            CameraEntry(
+                name=name,
+                image_topic=f"/camera/{name}/image_raw/compressed",
+                camera_info_topic=f"/camera/{name}/camera_info",
+                frame_id=f"{name}_optical_frame",
+                calibration=LENSES["no distortion"],
+                base_T_camera=PoseEntry.from_matrix(pose),
+            ).model_copy(update=changes)
+        )
+    return RigLayout(cameras=tuple(entries))
+
+
+def short_drive(**sensors: object) -> DriveSpec:
+    """Three sets of two small cameras on the street, at once."""
+    own = Sensors(stagger=0.4, lidar=Lidar(beams=8, columns=240)).model_copy(update=sensors)
+    return DriveSpec(layout=two_cameras(), world=street_spec(), sensors=own, seconds=0.3)
