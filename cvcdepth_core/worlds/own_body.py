@@ -25,6 +25,7 @@ _CLEAR = 0.07  # metres between a camera and the body below it
 _FLATTEST = 0.35
 _FOOTPRINT = (4.4, 1.7)  # metres: what of a vehicle must not stand in anything
 _HEIGHTS = (0.5, 1.0)
+_MOSTLY = 6  # of eight directions
 
 
 def own_body(site: Site, kind: BodyKind, base_T_cameras: Sequence[Pose], seed: int) -> Mesh | None:
@@ -71,18 +72,40 @@ def check_start(scene: Scene, way: Way) -> None:
     """Raise ConfigError, naming the object and the place, if the vehicle would begin its drive inside of something."""
     pose = way.pose(0.0)
     scene.set_moment(0.0, pose, 0.0)
+    found = _standing_in(scene, pose)
+    if found is None:
+        found = _enclosing(scene, pose)
+    if found is not None:
+        x, y, _ = pose[:3, 3].tolist()
+        name = scene.world.names[found]
+        raise ConfigError(f"the vehicle starts inside of something: {name} at x {x:.1f}, y {y:.1f}")
+
+
+def _standing_in(scene: Scene, pose: Pose) -> int | None:
+    """Return the object that sides or diagonals of the vehicle's outline run through."""
     length, width = _FOOTPRINT
     corners = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)]) * (length / 2, width / 2) + (0.8, 0.0)
     lines = [(corners[a], corners[b]) for a, b in ((0, 1), (1, 2), (2, 3), (3, 0), (0, 2), (1, 3))]
     starts = np.array([(*a, z) for z in _HEIGHTS for a, _ in lines])
     ends = np.array([(*b, z) for z in _HEIGHTS for _, b in lines])
     lengths = np.linalg.norm(ends - starts, axis=1)
-    ways = (ends - starts) / lengths[:, None]
-    rays = Rays(starts @ pose[:3, :3].T + pose[:3, 3], ways @ pose[:3, :3].T)
+    hits = scene.nearest(_placed(starts, (ends - starts) / lengths[:, None], pose))
+    objects = scene.faces.objects[np.maximum(hits.faces, 0)]
+    met = np.flatnonzero((hits.faces >= 0) & (hits.distances < lengths) & (objects != OWN_VEHICLE))
+    return int(objects[met[0]]) if len(met) else None
+
+
+def _enclosing(scene: Scene, pose: Pose) -> int | None:
+    """Return the object whose walls are seen from behind all around."""
+    angles = np.arange(8) * np.pi / 4
+    ways = np.stack([np.cos(angles), np.sin(angles), np.zeros(8)], axis=1)
+    rays = _placed(np.tile([0.8, 0.0, 1.0], (8, 1)), ways, pose)
     hits = scene.nearest(rays)
-    met = (hits.faces >= 0) & (hits.distances < lengths)
-    met[met] &= scene.faces.objects[hits.faces[met]] != OWN_VEHICLE
-    if met.any():
-        name = scene.world.names[scene.faces.objects[hits.faces[np.flatnonzero(met)[0]]]]
-        x, y, _ = pose[:3, 3].tolist()
-        raise ConfigError(f"the vehicle starts inside of something: {name} at x {x:.1f}, y {y:.1f}")
+    faces = np.maximum(hits.faces, 0)
+    behind = np.einsum("ni,ni->n", scene.faces.plane[faces, :3], rays.directions) > 0
+    seen = scene.faces.objects[faces][(hits.faces >= 0) & behind & (scene.faces.objects[faces] != OWN_VEHICLE)]
+    return int(seen[0]) if len(seen) >= _MOSTLY and (seen == seen[0]).all() else None
+
+
+def _placed(starts: Floats, ways: Floats, pose: Pose) -> Rays:
+    return Rays(starts @ pose[:3, :3].T + pose[:3, 3], ways @ pose[:3, :3].T)
