@@ -96,10 +96,17 @@ def rotate(rotation: Floats, points: Floats) -> Floats:
     return np.stack([row[0] * x + row[1] * y + row[2] * z for row in rotation], axis=-1)
 
 
+def cross(a: Floats, b: Floats) -> Floats:
+    """Return the cross products of vectors [N, 3]; numpy's own takes ten times as long for a few of them."""
+    (ax, ay, az), (bx, by, bz) = a.T, b.T
+    product: Floats = np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx]).T
+    return product
+
+
 def face_normals(vertices: Floats, faces: Ints) -> Floats:
     """Return unit normals [F, 3]; zeros for faces without area."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
-    normals = np.cross(b - a, c - a)
+    normals = cross(b - a, c - a)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return normals / np.where(length > 0, length, 1.0)
 
@@ -118,7 +125,7 @@ def _planar_uv(vertices: Floats, faces: Ints) -> Floats:
     safe = np.where(level > 0, level, 1.0)
     tangent = np.stack([-normals[:, 1] / safe, normals[:, 0] / safe, np.zeros_like(level)], axis=1)
     tangent[np.abs(normals[:, 2]) > _FLAT] = (1.0, 0.0, 0.0)
-    upward = np.cross(normals, tangent)
+    upward = cross(normals, tangent)
     upward[np.abs(normals[:, 2]) > _FLAT] = (0.0, 1.0, 0.0)
     corners = vertices[faces]
     uv = [np.einsum("fcj,fj->fc", corners, axis) for axis in (tangent, upward)]
@@ -144,6 +151,7 @@ def _smooth_normals(mesh: Mesh, cosine: float) -> Floats:
     return (total / np.where(length > 0, length, 1.0)).reshape(-1, 3, 3).astype(np.float32)
 
 
+_X, _Z = np.array([[1.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 1.0]])
 _BOX_FACES = np.array(
     [(0, 2, 1), (0, 3, 2), (4, 5, 6), (4, 6, 7), (0, 1, 5), (0, 5, 4)]
     + [(1, 2, 6), (1, 6, 5), (2, 3, 7), (2, 7, 6), (3, 0, 4), (3, 4, 7)]
@@ -206,10 +214,10 @@ def tube(points: Any, radii: Any, material: int, sides: int = 6, closed: bool = 
     points, radii = np.asarray(points, np.float64), np.asarray(radii, np.float64)
     along = np.gradient(points, axis=0)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
-    helper = np.where(np.abs(along[:, 2:]) > 0.9, [[1.0, 0.0, 0.0]], [[0.0, 0.0, 1.0]])
-    across = np.cross(helper, along)
+    helper = np.where(np.abs(along[:, 2:]) > 0.9, _X, _Z)
+    across = cross(helper, along)
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
-    upward = np.cross(along, across)
+    upward = cross(along, across)
     angle = np.linspace(0.0, 2 * math.pi, sides + 1)
     ring = np.cos(angle)[:, None] * across[:, None] + np.sin(angle)[:, None] * upward[:, None]
     surface = points[:, None] + radii[:, None, None] * ring

@@ -26,7 +26,16 @@ class Path:
         Lengths are rounded to whole steps of 0.25 m.
         """
         curvatures = [np.linspace(a, b, max(1, round(length / _STEP)) + 1) for length, a, b in segments]
-        middle = np.concatenate([(c[1:] + c[:-1]) / 2 for c in curvatures]) if curvatures else np.zeros(0)
+        self._lay(start, np.concatenate([np.zeros(0), *((c[1:] + c[:-1]) / 2 for c in curvatures)]))
+
+    @classmethod
+    def from_curvatures(cls, start: tuple[float, float, float], curvatures: Floats) -> Path:
+        """Build it from the curvature of each step of 0.25 m."""
+        path = cls(start, ())
+        path._lay(start, curvatures)
+        return path
+
+    def _lay(self, start: tuple[float, float, float], middle: Floats) -> None:
         self._curvature = np.r_[middle, middle[-1:] if len(middle) else 0.0]
         self._heading = start[2] + np.r_[0.0, np.cumsum(middle * _STEP)]
         half = self._heading[:-1] + middle * _STEP / 2
@@ -112,7 +121,7 @@ def _resampled(start: tuple[float, float, float], lengths: Floats, curvatures: F
     headings = np.r_[0.0, np.cumsum(lengths * curvatures)]
     count = max(1, round(ends[-1] / _STEP))
     turned = np.interp(np.arange(count + 1) * _STEP, ends, headings)
-    return Path(start, [(_STEP, k, k) for k in np.diff(turned) / _STEP])
+    return Path.from_curvatures(start, np.diff(turned) / _STEP)
 
 
 def eased(segments: Sequence[tuple[float, float]], easement: float = 6.0) -> list[tuple[float, float, float]]:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cvcdepth_core.rig.poses import Pose
-from cvcdepth_core.worlds.meshes import Floats, Ints, Mesh, joined
+from cvcdepth_core.worlds.meshes import Floats, Ints, Mesh, cross, joined
 from cvcdepth_core.worlds.ray_engine import Hits, TriangleScene
 from cvcdepth_core.worlds.world import OWN_VEHICLE, World
 
@@ -42,7 +42,7 @@ class _Faces:
     def write(self, numbers: Ints, corners: Floats, normals: Floats) -> None:
         """Say where faces are: `corners` [F, 3, 3] float32 as rays meet them, `normals` as a `Mesh` has them."""
         exact = corners.astype(np.float64)
-        flat = np.cross(exact[:, 1] - exact[:, 0], exact[:, 2] - exact[:, 0])
+        flat = cross(exact[:, 1] - exact[:, 0], exact[:, 2] - exact[:, 0])
         length = np.linalg.norm(flat, axis=1, keepdims=True)
         flat /= np.where(length > 0, length, 1.0)
         self.plane[numbers, :3] = flat

@@ -11,7 +11,7 @@ import numpy as np
 
 from cvcdepth_core.rig.poses import Pose
 from cvcdepth_core.worlds.description import Drive, Motion, Placed
-from cvcdepth_core.worlds.meshes import Floats
+from cvcdepth_core.worlds.meshes import Floats, cross
 from cvcdepth_core.worlds.paths import Path, eased
 from cvcdepth_core.worlds.site import Site
 
@@ -83,7 +83,7 @@ class Trajectory:
         left = np.stack([-np.sin(heading), np.cos(heading), aside], axis=-1)
         left = _unit(left - forward * (forward * left).sum(axis=-1, keepdims=True))
         poses = np.tile(np.eye(4), (len(times), 1, 1))
-        poses[:, :3, :3] = np.stack([forward, left, np.cross(forward, left)], axis=-1)
+        poses[:, :3, :3] = np.stack([forward, left, cross(forward, left)], axis=-1)
         poses[:, :3, 3] = np.c_[xy, z]
         return poses
 

@@ -252,11 +252,12 @@ def _end_cap(ring: Floats, material: int, front: bool) -> Mesh:
 
 def _wheels(make: _Make, s: _Shape) -> Iterator[Mesh]:
     r = s.wheel_radius
+    one = wheel(r, _TYRE_WIDTH, make.tyre, make.rim, spokes=make.black)
     for share in s.axles:
         x = share * s.length - s.length / 2
         for side in (-1.0, 1.0):
             y = side * (s.width / 2 - _TYRE_WIDTH / 2 + 0.015)
-            yield wheel(r, _TYRE_WIDTH, make.tyre, make.rim, spokes=make.black).moved(x, y, r)
+            yield one.moved(x, y, r)
             yield _arch(x, side * (s.width / 2 + 0.004), r + 0.02, 1.17 * r, make.black)
 
 
