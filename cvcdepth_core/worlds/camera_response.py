@@ -75,7 +75,8 @@ def _noisy(exposed: Floats, noise: float, seed: tuple[int, ...]) -> Floats:
     """Add the noise of photons, which grows with the light's root, and of reading, which is always there."""
     rng = np.random.default_rng(seed)
     deviation = np.float32(noise) * (np.float32(0.12) + np.sqrt(np.clip(exposed, 0.0, 1.5)))
-    return exposed + deviation * rng.standard_normal(exposed.shape, np.float32)
+    found: Floats = exposed + deviation * rng.standard_normal(exposed.shape, np.float32)
+    return found
 
 
 def _toned(exposed: Floats, look: CameraLook) -> Floats:

@@ -12,7 +12,6 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
-
 _FASTEST = 60  # m/s
 
 
@@ -277,7 +276,6 @@ class Motion(Part):
     """Time and speed; in between the speed changes evenly, before and after it stays."""
     bends: tuple[Point, ...] | None = None
     """Length and curvature of each piece of its own way."""
-
 
 
 class Vehicle(Placed):

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -105,7 +106,7 @@ def _sign(m: _Make) -> Iterator[Mesh]:
         else:
             wide, high = m.rng.uniform(0.3, 1.0), m.rng.uniform(0.25, 0.7)
             face = m.add(sign_face(m.bright(), (0.62, 0.62, 0.6), wide, high))
-            yield box(0.03, wide, high, face, -high / 2).moved(-0.06, 0, z)
+            yield box(0.03, wide, high, face).moved(-0.06, 0, z - high / 2)
 
 
 def _plate(corners: int, radius: float, face: int, back: int) -> Mesh:
@@ -115,7 +116,8 @@ def _plate(corners: int, radius: float, face: int, back: int) -> Mesh:
     upright = prism(outline, 0.0, 0.02, back, cap=face)
     # Its upper face, towards z, is turned to -x; x becomes -y.
     turn = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    return upright.transformed(turn)
+    # The texture of signs begins at their lower edge.
+    return replace(upright.transformed(turn), uv=upright.uv + np.array([0.0, radius], np.float32))
 
 
 def _traffic_light(m: _Make) -> Iterator[Mesh]:
@@ -191,14 +193,14 @@ def _shelter(m: _Make) -> Iterator[Mesh]:
         for y in (-0.6, 0.65):
             yield box(0.08, 0.08, m.h - 0.1, m.body).moved(x, y)
     yield box(3.4, 0.03, m.h - 0.6, glass, 0.3).moved(0, 0.65)
-    yield box(0.12, 1.2, 1.9, advert, 0.3).moved(1.7, 0)
+    yield box(0.12, 1.2, 1.9, advert).moved(1.7, 0, 0.3)
     yield box(2.4, 0.35, 0.05, m.body, 0.45).moved(-0.3, 0.4)
 
 
 def _billboard(m: _Make) -> Iterator[Mesh]:
     wide, high = m.rng.uniform(3.5, 9.0), m.rng.uniform(2.2, 3.8)
     face = m.add(sign_face(m.bright(), (0.7, 0.7, 0.68), wide, high))
-    yield box(0.3, wide, high, face, m.h - high)
+    yield box(0.3, wide, high, face).moved(0, 0, m.h - high)
     for y in (-wide / 3, wide / 3):
         yield cylinder(0.16, m.h - high, m.body, 8).moved(0.1, y)
 
@@ -215,7 +217,7 @@ def _barrel(m: _Make) -> Iterator[Mesh]:
 
 
 def _container(m: _Make) -> Iterator[Mesh]:
-    skin = m.add(corrugated(darker(tuple(m.rng.uniform(0.03, 0.45, 3).tolist()), 1.0)))  # type: ignore[arg-type]
+    skin = m.add(corrugated(darker(tuple(m.rng.uniform(0.03, 0.45, 3).tolist()), 1.0)))
     length = 12.2 if m.rng.random() < 0.5 else 6.1
     for level in range(max(1, round(m.h / 2.6))):
         yield box(length, 2.44, 2.58, skin, 2.6 * level)
@@ -232,7 +234,11 @@ def _planter(m: _Make) -> Iterator[Mesh]:
 def _rock(m: _Make) -> Iterator[Mesh]:
     rough = 1.0 + 0.13 * m.rng.normal(size=len(sphere_vertices(2)))
     skin = m.add(stone((0.22, 0.21, 0.19)))
-    yield sphere(m.h * 0.7, skin, 2, rough).scaled(*m.rng.uniform(0.8, 1.3, 2).tolist(), 0.9).moved(0, 0, m.h * 0.35)
+    yield (
+        sphere(m.h * 0.7, skin, 2, rough)
+        .scaled(float(m.rng.uniform(0.8, 1.3)), float(m.rng.uniform(0.8, 1.3)), 0.9)
+        .moved(0, 0, m.h * 0.35)
+    )
 
 
 def _pallets(m: _Make) -> Iterator[Mesh]:

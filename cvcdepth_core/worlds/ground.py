@@ -60,7 +60,8 @@ def _lines(low: float, high: float, margin: float) -> Floats:
     fine = np.arange(low, high + _FINE, _FINE)
     coarse = np.arange(_COARSE, margin, _COARSE)
     outward = np.r_[coarse, margin + np.array(_HORIZON)]
-    return np.r_[low - outward[::-1], fine, fine[-1] + outward]
+    found: Floats = np.r_[low - outward[::-1], fine, fine[-1] + outward]
+    return found
 
 
 def _patch(site: Site, patch: Patch) -> Mesh:
@@ -72,7 +73,8 @@ def _patch(site: Site, patch: Patch) -> Mesh:
 
     def laid(x: Floats, y: Floats, lift: float) -> Floats:
         points = np.stack([place.x + c * x - s * y, place.y + s * x + c * y], axis=-1).reshape(-1, 2)
-        return np.c_[points, site.terrain.height(points) + lift]
+        found: Floats = np.c_[points, site.terrain.height(points) + lift]
+        return found
 
     parts = [grid(laid(u, v, _ON_GROUND).reshape(*u.shape, 3), np.stack([u, v], axis=-1), material)]
     if patch.bays:

@@ -35,7 +35,8 @@ def _ring(site: Site, distance: float, angles: Floats) -> Floats:
     points = [c.path.points(np.linspace(0, c.path.length, 40)) for c in site.corridors]
     around = np.concatenate(points) if points else np.zeros((1, 2))
     middle, half = (around.max(axis=0) + around.min(axis=0)) / 2, np.ptp(around, axis=0) / 2
-    return middle + np.stack([np.cos(angles), np.sin(angles)], axis=-1) * (half + distance)
+    found: Floats = middle + np.stack([np.cos(angles), np.sin(angles)], axis=-1) * (half + distance)
+    return found
 
 
 def _off_roads(site: Site, places: Floats) -> Floats:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from cvcdepth_core.worlds.description import BarrierKind, SurfaceKind, WallKind
@@ -30,14 +30,14 @@ class Kind:
     open_width: Range = (20.0, 50.0)
     """Width of the paved place where there are no lanes."""
     one_way: float = 0.0
-    surfaces: Mapping[SurfaceKind, float] = None  # type: ignore[assignment]
+    surfaces: Mapping[SurfaceKind, float] = field(default_factory=dict)
     pavement: Range = (0.0, 0.0)
     edge_lines: float = 0.2
     curved: float = 0.4
     radius: Range = (60.0, 500.0)
     hilly: float = 0.6
     banks: float = 0.1
-    grounds: Mapping[SurfaceKind, float] = None  # type: ignore[assignment]
+    grounds: Mapping[SurfaceKind, float] = field(default_factory=dict)
     crossing: float = 0.0
     """Chance of a crossing road."""
     crossing_at: float = 45.0
@@ -48,7 +48,7 @@ class Kind:
     heights: Range = (4.0, 10.0)
     lengths: Range = (8.0, 24.0)
     gap: Range = (0.0, 6.0)
-    walls: Mapping[WallKind, float] = None  # type: ignore[assignment]
+    walls: Mapping[WallKind, float] = field(default_factory=dict)
     pitched: float = 0.3
     """Share of roofs that are pitched."""
     shops: float = 0.0
@@ -59,7 +59,7 @@ class Kind:
     """Single trees behind the road."""
     woods: Range = (0, 0)
     """Trees of a wood."""
-    horizon: Mapping[HorizonKind, float] = None  # type: ignore[assignment]
+    horizon: Mapping[HorizonKind, float] = field(default_factory=dict)
     """Chance of each thing far away."""
     tall_grass: float = 0.0
     """Chance of tall grass beside the road."""

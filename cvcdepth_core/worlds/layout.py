@@ -97,4 +97,5 @@ def _overlaps(one: Floats, others: Floats) -> Floats:
     apart |= own_v > one[5] + others[:, 4] * sd + others[:, 5] * cd
     apart |= their_u > others[:, 4] + one[4] * cd + one[5] * sd
     apart |= their_v > others[:, 5] + one[4] * sd + one[5] * cd
-    return ~apart
+    found: Floats = ~apart
+    return found

@@ -57,7 +57,8 @@ class Lens:
         rays = self.centre_rays
         down = np.linalg.norm(np.gradient(rays, axis=1), axis=0) if self.height > 1 else 0.0
         right = np.linalg.norm(np.gradient(rays, axis=2), axis=0) if self.width > 1 else 0.0
-        return np.sqrt(np.maximum(down, 1e-9) * np.maximum(right, 1e-9))
+        found: Floats = np.sqrt(np.maximum(down, 1e-9) * np.maximum(right, 1e-9))
+        return found
 
     def _normalised(self, pixels: Floats) -> Floats:
         """Return x / z and y / z [N, 2] of the raw camera's rays."""

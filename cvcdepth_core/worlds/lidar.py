@@ -90,7 +90,8 @@ def _directions(lidar: Lidar, columns: Floats) -> Floats:
 def _deskewed(points: Floats, poses: Floats, columns: Floats, lidar_T_world: Pose) -> Floats:
     """Move points [M, 3], each seen from `poses[column]`, to the frame of `lidar_T_world`."""
     relative = np.einsum("ij,cjk->cik", lidar_T_world, poses)[columns]
-    return np.einsum("mij,mj->mi", relative[:, :3, :3], points) + relative[:, :3, 3]
+    found: Floats = np.einsum("mij,mj->mi", relative[:, :3, :3], points) + relative[:, :3, 3]
+    return found
 
 
 def _measured(found: Sweep, lidar: Lidar, seed: tuple[int, ...]) -> Sweep:

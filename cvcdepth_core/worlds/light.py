@@ -82,21 +82,24 @@ class Light:
         density = self._clouds(directions, height)
         lit = _column(self.cloud) * (0.85 + 0.35 * toward**6) * (1.08 - 0.3 * density)
         colour = colour * (1.0 - density) + lit * density
-        return colour + _column(self.sunlight) * (40.0 * (toward > _DISC) * (1.0 - density))
+        found: Floats = colour + _column(self.sunlight) * (40.0 * (toward > _DISC) * (1.0 - density))
+        return found
 
     def ambient(self, normals: Floats) -> Floats:
         """Light [3, N] of sky and ground on open surfaces with the unit normals [3, N]."""
         upward = (0.5 + 0.5 * normals[2]).astype(np.float32)
         above = 0.55 * self.zenith + 0.45 * self.horizon
         side = _column(self.horizon - above) * (1.0 - np.abs(normals[2])) * 0.5
-        return _column(above) * upward + side * upward + _column(self.ground) * (1.0 - upward)
+        found: Floats = _column(above) * upward + side * upward + _column(self.ground) * (1.0 - upward)
+        return found
 
     def through_air(self, light: Floats, directions: Floats, distances: Floats) -> Floats:
         """Light [3, N] of things at these distances [N] as it arrives."""
         left = np.exp(-distances / np.float32(self.visibility)).astype(np.float32)
         toward = np.clip(_dot(directions, self.sun), 0.0, 1.0) ** 6
         air = _column(self.horizon) * 0.92 + _column(self.sunlight) * (0.05 * self.glow * toward)
-        return light * left + air * (1.0 - left)
+        found: Floats = light * left + air * (1.0 - left)
+        return found
 
     def _clouds(self, directions: Floats, height: Floats) -> Floats:
         if self.cover <= 0.0:
@@ -128,4 +131,5 @@ def _column(colour: Floats) -> Floats:
 
 def _dot(vectors: Floats, axis: Floats) -> Floats:
     x, y, z = axis.astype(np.float32)
-    return vectors[0] * x + vectors[1] * y + vectors[2] * z
+    found: Floats = vectors[0] * x + vectors[1] * y + vectors[2] * z
+    return found

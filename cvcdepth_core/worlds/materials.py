@@ -124,7 +124,21 @@ def _row(material: Material, number: int) -> tuple[float, ...]:
     # Each material begins elsewhere in the tiles, so that like ones side by side do not look alike.
     offset = np.random.default_rng([7, number]).uniform(0.0, 256.0, 2).tolist()
     layers = (m.coarse.kind, m.coarse.texels, m.coarse.amplitude, m.fine.kind, m.fine.texels, m.fine.amplitude)
-    return (m.pattern, *m.colour, *m.second, *layers, m.gloss, m.leafy, m.emission, *offset, m.ripple, 0, 0, 0, *parameters)
+    return (
+        m.pattern,
+        *m.colour,
+        *m.second,
+        *layers,
+        m.gloss,
+        m.leafy,
+        m.emission,
+        *offset,
+        m.ripple,
+        0,
+        0,
+        0,
+        *parameters,
+    )
 
 
 class Surface(NamedTuple):
@@ -153,9 +167,10 @@ class _Place(NamedTuple):
     fine: Floats
 
     def parameter(self, number: int) -> Floats:
-        return self.rows[_COMMON + number]
+        found: Floats = self.rows[_COMMON + number]
+        return found
 
-    def sharpness(self, size: Floats | float) -> Floats:
+    def sharpness(self, size: Floats | np.float32 | float) -> Floats:
         """1 where details of this size (metres) can be seen, 0 where they are far below a pixel."""
         return np.clip(size / np.maximum(self.footprint, 1e-6) - 0.3, 0.0, 1.0).astype(np.float32)
 
@@ -169,7 +184,9 @@ def evaluate(table: Floats, materials: Ints, u: Floats, v: Floats, footprint: Fl
     shade = np.clip(1.0 + coarse + fine, 0.15, 2.2)
     wet = np.clip(0.65 + 0.5 * coarse / np.maximum(rows[9], 1e-3), 0.1, 1.0)
     gloss = rows[13] * np.where(rows[18] > 0, wet, 1.0)
-    surface = Surface(rows[1:4] * shade, gloss, rows[14], rows[1:4] * rows[15], rows[18] * fine / np.maximum(rows[12], 1e-3))
+    surface = Surface(
+        rows[1:4] * shade, gloss, rows[14], rows[1:4] * rows[15], rows[18] * fine / np.maximum(rows[12], 1e-3)
+    )
     place = _Place(rows, u, v, footprint, coarse, fine)
     pattern = rows[0].astype(np.int32)
     for number, apply in _PATTERNS.items():
@@ -183,7 +200,10 @@ def evaluate(table: Floats, materials: Ints, u: Floats, v: Floats, footprint: Fl
 
 def _layer(rows: Floats, first: int, u: Floats, v: Floats, footprint: Floats) -> Floats:
     kind, texels, amplitude = rows[first], rows[first + 1], rows[first + 2]
-    return amplitude * noise(kind.astype(np.int32), u * texels + rows[16], v * texels + rows[17], footprint * texels)
+    found: Floats = amplitude * noise(
+        kind.astype(np.int32), u * texels + rows[16], v * texels + rows[17], footprint * texels
+    )
+    return found
 
 
 def _mottled(surface: Surface, chosen: Ints, place: _Place) -> None:
@@ -212,7 +232,8 @@ def _brick_colour(place: _Place, colour: Floats, length: Floats | np.float32, he
     joint = np.float32(0.011)
     in_joint = (_lines(along, joint / length) | _lines(place.v / height, joint / height)) * place.sharpness(0.02)
     own = 1.0 + 0.5 * (_hash(np.floor(along), row) - 0.5) * place.sharpness(height)
-    return colour * own * (1.0 - in_joint) + place.rows[4:7] * in_joint
+    found: Floats = colour * own * (1.0 - in_joint) + place.rows[4:7] * in_joint
+    return found
 
 
 def _stripes(surface: Surface, chosen: Ints, place: _Place) -> None:
@@ -362,7 +383,8 @@ def _brick_wall(place: _Place, colour: Floats) -> Floats:
 def _panel_wall(place: _Place, colour: Floats) -> Floats:
     storey, bay, ground = place.parameter(0), place.parameter(1), place.parameter(5)
     joint = _lines(place.u / bay, 0.02 / bay) | _lines((place.v - ground) / storey, 0.02 / storey)
-    return colour * (1.0 - 0.35 * joint * place.sharpness(0.03))
+    found: Floats = colour * (1.0 - 0.35 * joint * place.sharpness(0.03))
+    return found
 
 
 def _board_wall(place: _Place, colour: Floats) -> Floats:
@@ -370,7 +392,8 @@ def _board_wall(place: _Place, colour: Floats) -> Floats:
 
 
 def _metal_wall(place: _Place, colour: Floats) -> Floats:
-    return colour * (1.0 + 0.28 * np.sin(place.u * np.float32(2 * np.pi / 0.22)) * place.sharpness(0.11))
+    found: Floats = colour * (1.0 + 0.28 * np.sin(place.u * np.float32(2 * np.pi / 0.22)) * place.sharpness(0.11))
+    return found
 
 
 _WALLS = {1.0: _brick_wall, 2.0: _panel_wall, 3.0: _board_wall, 4.0: _metal_wall}

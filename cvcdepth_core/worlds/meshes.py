@@ -36,7 +36,7 @@ class Mesh:
 
     def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Mesh:
         """Return it shifted."""
-        return replace(self, vertices=self.vertices + (x, y, z))
+        return replace(self, vertices=self.vertices + np.array([x, y, z]))
 
     def turned(self, yaw: float) -> Mesh:
         """Return it turned about the z axis, radians."""
@@ -148,14 +148,15 @@ def _smooth_normals(mesh: Mesh, cosine: float) -> Floats:
     alike = np.einsum("nkj,nj->nk", other_normals, own) > cosine
     total = (other_normals * alike[..., None]).sum(axis=1) + 1e-9 * own
     length = np.linalg.norm(total, axis=1, keepdims=True)
-    return (total / np.where(length > 0, length, 1.0)).reshape(-1, 3, 3).astype(np.float32)
+    found: Floats = (total / np.where(length > 0, length, 1.0)).reshape(-1, 3, 3).astype(np.float32)
+    return found
 
 
 _X, _Z = np.array([[1.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 1.0]])
 _BOX_FACES = np.array(
-    [(0, 2, 1), (0, 3, 2), (4, 5, 6), (4, 6, 7), (0, 1, 5), (0, 5, 4)]
-    + [(1, 2, 6), (1, 6, 5), (2, 3, 7), (2, 7, 6), (3, 0, 4), (3, 4, 7)]
-)
+    [(0, 2, 1), (0, 3, 2), (4, 5, 6), (4, 6, 7), (0, 1, 5), (0, 5, 4), (1, 2, 6), (1, 6, 5), (2, 3, 7), (2, 7, 6),
+     (3, 0, 4), (3, 4, 7)]
+)  # fmt: skip
 
 
 def box(
@@ -279,13 +280,16 @@ def _fan(centre: Floats, ring: Floats, material: int) -> Mesh:
 def _icosphere(subdivisions: int) -> tuple[Floats, Ints]:
     """Return unit sphere of 20 * 4^subdivisions triangles."""
     p = (1 + 5**0.5) / 2
-    corners = [(-1, p, 0), (1, p, 0), (-1, -p, 0), (1, -p, 0), (0, -1, p), (0, 1, p), (0, -1, -p), (0, 1, -p)]
-    corners += [(p, 0, -1), (p, 0, 1), (-p, 0, -1), (-p, 0, 1)]
+    corners = [
+        *((x, y, 0.0) for y in (p, -p) for x in (-1.0, 1.0)),
+        *((0.0, y, z) for z in (p, -p) for y in (-1.0, 1.0)),
+        *((x, 0.0, z) for x in (p, -p) for z in (-1.0, 1.0)),
+    ]
     faces = np.array(
-        [(0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4), (11, 10, 2), (10, 7, 6)]
-        + [(7, 1, 8), (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8), (3, 8, 9), (4, 9, 5), (2, 4, 11), (6, 2, 10)]
-        + [(8, 6, 7), (9, 8, 1)]
-    )
+        [(0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4), (11, 10, 2), (10, 7, 6),
+         (7, 1, 8), (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8), (3, 8, 9), (4, 9, 5), (2, 4, 11), (6, 2, 10),
+         (8, 6, 7), (9, 8, 1)]
+    )  # fmt: skip
     vertices = np.array(corners, np.float64) / math.hypot(1, p)
     for _ in range(subdivisions):
         vertices, faces = _subdivided(vertices, faces)

@@ -99,7 +99,8 @@ def _spectral(rng: np.random.Generator, slope: float, stretch: float = 1.0) -> F
     frequency = np.hypot(fx, fy * stretch)
     amplitude = np.where(frequency > 0, np.maximum(frequency, 1e-9) ** -slope, 0.0)
     values: Floats = np.fft.ifft2(np.fft.fft2(rng.normal(size=(TILE, TILE))) * amplitude).real
-    return values / values.std()
+    found: Floats = values / values.std()
+    return found
 
 
 def _pebbles(rng: np.random.Generator, cells: int = 16) -> Floats:
@@ -117,7 +118,8 @@ def _pebbles(rng: np.random.Generator, cells: int = 16) -> Floats:
             nearer = squared < distance
             shade = np.where(nearer, shades[row % cells, column % cells], shade)
             distance = np.where(nearer, squared, distance)
-    return shade - 2.5 * (np.sqrt(distance) / step) ** 2
+    found: Floats = shade - 2.5 * (np.sqrt(distance) / step) ** 2
+    return found
 
 
 def _standardised(tile: Floats) -> Floats:

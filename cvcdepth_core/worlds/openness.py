@@ -55,7 +55,8 @@ def _hemisphere(normals: Floats, ways: Floats) -> Floats:
     b = x * y * a
     first = np.stack([1.0 + sign * x * x * a, sign * b, -sign * x], axis=1)
     second = np.stack([b, sign + y * y * a, -y], axis=1)
-    return first * ways[:, :1] + second * ways[:, 1:2] + normals * ways[:, 2:]
+    found: Floats = first * ways[:, :1] + second * ways[:, 1:2] + normals * ways[:, 2:]
+    return found
 
 
 def _mean_around(values: Floats, truth: Truth) -> Floats:

@@ -50,7 +50,8 @@ class Path:
     def heading(self, s: Floats | float) -> Floats:
         """Direction of travel at s, radians."""
         i, ds = self._sample(s)
-        return self._heading[i] + np.where(self._inside(s), self._curvature[i], 0.0) * ds
+        found: Floats = self._heading[i] + np.where(self._inside(s), self._curvature[i], 0.0) * ds
+        return found
 
     def curvature(self, s: Floats | float) -> Floats:
         """1/m at s, positive to the left; 0 beyond the ends."""
@@ -70,7 +71,7 @@ class Path:
         return np.stack([x, y], axis=-1)
 
     def locate(self, points: Floats) -> tuple[Floats, Floats]:
-        """Return s and l of points [N, 2], by the nearest place on the curve; beyond its ends s lies outside [0, length]."""
+        """Return s and l of points [N, 2], by the nearest place on the curve; s may lie beyond its ends."""
         coarse = self._points[::_SEARCH_STEP]
         nearest = np.empty(len(points), np.int64)
         for first in range(0, len(points), 4096):

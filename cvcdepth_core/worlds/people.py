@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -85,7 +85,7 @@ def _head(make: _Make, z: float, h: float, x: float = 0.02) -> list[Mesh]:
     return [head, hair, neck]
 
 
-def _limb(points: list[tuple[float, float, float]], radii: list[float], material: int, sides: int = 7) -> Mesh:
+def _limb(points: Sequence[tuple[float, float, float]], radii: list[float], material: int, sides: int = 7) -> Mesh:
     return tube(points, radii, material, sides)
 
 

@@ -5,7 +5,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from cvcdepth_core.worlds.description import Barrier, Furniture, Patch, Structure, SurfaceKind, Vehicle, WorldSpec
+from cvcdepth_core.worlds.description import (
+    Barrier,
+    Furniture,
+    Patch,
+    Structure,
+    StructureKind,
+    SurfaceKind,
+    Vehicle,
+    VehicleKind,
+    WorldSpec,
+)
 from cvcdepth_core.worlds.dice import Dice
 from cvcdepth_core.worlds.layout import Layout
 from cvcdepth_core.worlds.random_traffic import LENGTHS
@@ -39,7 +49,7 @@ def special_places(world: WorldSpec, layout: Layout, dice: Dice) -> Special:
         special.structures += (Structure(kind="gantry", at=at, size=(1.0, width, 5.5)),)
     if world.kind in ("city", "industrial", "yard") and dice.chance(0.15):
         at = (layout.start + dice.between(20, 120, 0), dice.pick(-1, 1) * dice.between(45, 90, 0))
-        kind = dice.pick("crane", "tower")
+        kind: StructureKind = dice.pick("crane", "tower")
         size = (40.0, 1.0, dice.between(25, 50, 0)) if kind == "crane" else (8.0, 8.0, dice.between(12, 30, 0))
         special.structures += (Structure(kind=kind, at=at, yaw=dice.between(0, 360, 0), size=size, seed=dice.seed()),)
     return special
@@ -72,7 +82,7 @@ def _parking_deck(world: WorldSpec, layout: Layout, dice: Dice, special: Special
         special.patches += (patch,)
         s = first + 7.0
         while s < last - 7:
-            kind = dice.pick("hatchback", "saloon", "suv", "estate")
+            kind: VehicleKind = dice.pick("hatchback", "saloon", "suv", "estate")
             at = (round(s, 2), round(l, 2))
             if dice.chance(share) and layout.take(at, (LENGTHS[kind], 2.2), 90.0, 0, None):
                 yaw = dice.pick(90.0, 270.0) + dice.normal(1.0)
@@ -103,7 +113,7 @@ def _lots(world: WorldSpec, layout: Layout, dice: Dice, special: Special) -> Non
         if lot:
             share = dice.between(0.1, 0.9)
             for i in range(int(size[0] / 2.6)):
-                kind = dice.pick("hatchback", "saloon", "suv", "estate", "van")
+                kind: VehicleKind = dice.pick("hatchback", "saloon", "suv", "estate", "van")
                 s = at[0] - size[0] / 2 + 0.5 + 1.3 + 2.6 * i
                 if dice.chance(share):
                     place = (round(s, 2), round(at[1] + dice.normal(0.2), 2))

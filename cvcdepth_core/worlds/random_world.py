@@ -27,7 +27,7 @@ from cvcdepth_core.worlds.layout import Layout
 from cvcdepth_core.worlds.random_parts import furnish
 
 _BEHIND, _AHEAD = 90.0, 110.0  # metres of world behind the start and beyond the end of the drive
-_EVEN_WEIGHTS = {name: kind.weight for name, kind in KINDS.items()}
+_WEIGHTS: dict[WorldKind, float] = {name: kind.weight for name, kind in KINDS.items()}
 
 
 def random_world(seed: int, kind: WorldKind | None = None, seconds: float = 10.0) -> WorldSpec:
@@ -35,8 +35,7 @@ def random_world(seed: int, kind: WorldKind | None = None, seconds: float = 10.0
 
     The same arguments always give the same world.
     """
-    dice = Dice(seed, 101)
-    name = kind or dice.weighted(_EVEN_WEIGHTS)
+    name: WorldKind = Dice(seed, 101).weighted(_WEIGHTS) if kind is None else kind
     if name not in KINDS:
         raise ConfigError(f"world kind {name}: there is none; there are {', '.join(get_args(WorldKind))}")
     return _Author(seed, name, seconds).write()
@@ -300,4 +299,4 @@ def _distance(speeds: tuple[tuple[float, float], ...], seconds: float) -> float:
     from cvcdepth_core.worlds.trajectories import SpeedProfile
 
     profile = SpeedProfile(speeds)
-    return max(0.0, *(profile.distance(seconds * i / 20) for i in range(21)))
+    return max(0.0, *(float(profile.distance(seconds * i / 20)) for i in range(21)))

@@ -101,8 +101,10 @@ class Renderer:
         spread = _finer(lens.pixel_angles[band.rows] / n, n).astype(np.float32)
         light = shade(self.scene, rays, spread, _finer(opened, n), lens.width * n)
         samples = light.reshape(3, len(opened), n, lens.width, n)
-        total = sum(samples[:, :, dy, :, dx] for dy in range(n) for dx in range(n))
-        return np.ascontiguousarray(np.moveaxis(total, 0, -1), np.float32) / np.float32(n * n)
+        mean = samples[:, :, 0, :, 0] / np.float32(n * n)
+        for dy, dx in [(i // n, i % n) for i in range(1, n * n)]:
+            mean += samples[:, :, dy, :, dx] / np.float32(n * n)
+        return np.ascontiguousarray(np.moveaxis(mean, 0, -1), np.float32)
 
 
 class _Band(NamedTuple):

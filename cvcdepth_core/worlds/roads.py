@@ -71,7 +71,7 @@ class _RoadBuilder:
     def _slab(self, inner: float, outer: float, top: int, sides: int) -> Iterator[Mesh]:
         """Return A raised strip with its sides and ends, wherever no other road runs."""
         across = np.array([inner, (inner + outer) / 2, outer])
-        free = ~self._in_other_carriageway(self.stations, across, 0.0).any(axis=1)
+        free = ~np.any(self._in_other_carriageway(self.stations, across, 0.0), axis=1)
         up, down = max(self.road.kerb, 0.01), -0.3
         for run in _runs(free):
             stations = self.stations[run]
@@ -129,7 +129,8 @@ class _RoadBuilder:
     def _drape(self, s: Floats, l: Floats) -> Floats:  # noqa: E741
         """Points [N, 3] on the ground at s and l [N]."""
         xy = self.corridor.path.points(s, l)
-        return np.c_[xy, self.site.terrain.height(xy) - self.number * _LATER]
+        found: Floats = np.c_[xy, self.site.terrain.height(xy) - self.number * _LATER]
+        return found
 
     def _in_other_carriageway(self, stations: Floats, across: Floats, margin: float) -> Floats:
         """Whether places lie on another road, [stations, across]."""
@@ -173,7 +174,7 @@ class _RoadBuilder:
             spans = [(s, s + _DASH) for s in np.arange(1.0, self.corridor.path.length - _DASH, _DASH + _GAP)]
         for first, last in spans:
             stations = np.linspace(first, last, max(2, round((last - first) / _STATION) + 1))
-            busy = self._in_other_carriageway(stations, across, 1.0).any(axis=1)
+            busy = np.any(self._in_other_carriageway(stations, across, 1.0), axis=1)
             for s in self.road.crossings:
                 busy |= np.abs(stations - s) < 3.5
             for run in _runs(~busy):
@@ -200,7 +201,7 @@ class _RoadBuilder:
                 l = (i + 0.5 - road.lanes / 2) * road.lane_width  # noqa: E741
                 forward = 1.0 if road.one_way or l < 0 else -1.0
                 places = outline * forward + (s, l)
-                points = self._drape(places[:, 0], places[:, 1]) + (0, 0, _PAINT)
+                points = self._drape(places[:, 0], places[:, 1]) + np.array([0, 0, _PAINT])
                 if not self._in_other_carriageway(np.array([s]), np.array([l]), 3.0).any():
                     yield flat_mesh(points, faces, paint)
 
@@ -214,7 +215,7 @@ class _RoadBuilder:
         angles = np.linspace(0.0, 2 * math.pi, 12, endpoint=False)
         for _ in range(int(self.corridor.path.length / 30 * 2 * self.road.wear)):
             s, l = rng.uniform(2, self.corridor.path.length - 2), rng.uniform(right + 0.5, left - 0.5)  # noqa: E741
-            points = self._drape(s + 0.33 * np.cos(angles), l + 0.33 * np.sin(angles)) + (0, 0, _PAINT / 2)
+            points = self._drape(s + 0.33 * np.cos(angles), l + 0.33 * np.sin(angles)) + np.array([0, 0, _PAINT / 2])
             yield flat_mesh(points, [(0, k, k + 1) for k in range(1, 11)], iron)
 
     def _paint(self, colour: Colour) -> int:

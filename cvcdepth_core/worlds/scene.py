@@ -59,7 +59,9 @@ class _Movers:
         meshes = [mover.mesh for mover in world.movers] + ([vehicle] if vehicle is not None else [])
         self.ways = [mover.way for mover in world.movers]
         self.mesh = joined(meshes)
-        self.objects = np.array([*(mover.number for mover in world.movers), *([OWN_VEHICLE] if vehicle else [])], np.int32)
+        self.objects = np.array(
+            [*(mover.number for mover in world.movers), *([OWN_VEHICLE] if vehicle else [])], np.int32
+        )
         count = np.arange(len(meshes))
         self.of_vertex = np.repeat(count, [len(mesh.vertices) for mesh in meshes])
         self.of_face = np.repeat(count, [len(mesh.faces) for mesh in meshes])
@@ -84,7 +86,7 @@ class Scene:
         self.faces = _Faces(whole, np.concatenate([world.objects, self._movers.face_objects]), self._still_faces)
         self._still = TriangleScene(world.mesh.vertices.astype(np.float32)[world.mesh.faces])
         self._moving = TriangleScene(np.zeros((0, 3, 3), np.float32))
-        self._near = np.zeros(0, np.int32)
+        self._near: Ints = np.zeros(0, np.int32)
         self._moment: tuple[float, bytes] | None = None
 
     def set_moment(self, time: float, world_T_base: Pose, speed: float = 0.0) -> None:
@@ -138,6 +140,7 @@ class Scene:
         open_ones = np.flatnonzero(~blocked)
         blocked[open_ones] = self._moving.blocked(origins[open_ones], directions[open_ones], reach[open_ones])
         return blocked
+
 
 def _single(values: Floats) -> Floats:
     return np.ascontiguousarray(values, np.float32)

@@ -84,7 +84,8 @@ def _lit(scene: Scene, places: _Places, opened: Floats, sun_offsets: Floats, lam
     if light.sunlight.any():
         received += _sun(scene, places, sun_offsets)
     received += _lamplight(lamps, places) * (0.4 + 0.6 * open_share)
-    return surface.colour * received + surface.emission
+    found: Floats = surface.colour * received + surface.emission
+    return found
 
 
 def _sun(scene: Scene, places: _Places, offsets: Floats) -> Floats:
@@ -111,11 +112,12 @@ def _sun(scene: Scene, places: _Places, offsets: Floats) -> Floats:
 
 @lru_cache(maxsize=4)
 def _sun_offsets(row: int, count: int) -> Floats:
-    """By how much each sample looks past the middle of the sun, across and up, [2, N]; neighbours to different sides."""
+    """By how much each sample looks past the sun's middle, across and up, [2, N]; neighbours to different sides."""
     index = np.arange(count)
     corner = (index % row % 2) + 2 * (index // row % 2)
     angle = np.float32(np.pi / 2) * corner + np.float32(0.6)
-    return np.stack([np.cos(angle), np.sin(angle)]).astype(np.float32) * np.float32(_SUN_RADIUS * 0.7)
+    found: Floats = np.stack([np.cos(angle), np.sin(angle)]).astype(np.float32) * np.float32(_SUN_RADIUS * 0.7)
+    return found
 
 
 def _lamplight(lamps: Lamps, places: _Places) -> Floats:
@@ -169,7 +171,8 @@ def _mirrored(scene: Scene, places: _Places, shiny: Ints, spread: Floats) -> Flo
 
 def _towards(normals: Floats, directions: Floats) -> Floats:
     """Turn normals [3, N] so that they face the rays."""
-    return normals * np.where(_dot(normals, directions) > 0, np.float32(-1.0), np.float32(1.0))
+    found: Floats = normals * np.where(_dot(normals, directions) > 0, np.float32(-1.0), np.float32(1.0))
+    return found
 
 
 def _dot(a: Floats, b: Floats) -> Floats:

@@ -148,7 +148,7 @@ class Shard:
         try:
             with zipfile.ZipFile(self.path) as archive:
                 parts = [archive.read(f"{stem}.{suffix}") for suffix in (self._suffix, "depth", "labels")]
-            picture = cv2.imdecode(np.frombuffer(parts[0], np.uint8), cv2.IMREAD_COLOR)
+            picture: Any = cv2.imdecode(np.frombuffer(parts[0], np.uint8), cv2.IMREAD_COLOR)
             height, width = picture.shape[:2]
             flat = np.frombuffer(zstandard.decompress(parts[2], max_output_size=height * width), np.uint8)
             depth = unpacked_depth(parts[1], height, width)

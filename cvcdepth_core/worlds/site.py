@@ -87,7 +87,8 @@ class Site:
 
     def height_on(self, x: float, y: float) -> float:
         """Return z of what one stands on: a pavement's upper side, a road, the ground."""
-        return self.terrain.at(x, y) + self.raised(np.array([[x, y]])).item()
+        found: float = self.terrain.at(x, y) + self.raised(np.array([[x, y]])).item()
+        return found
 
     def raised(self, points: Floats) -> Floats:
         """By how much pavements lift what stands on them, [N]."""

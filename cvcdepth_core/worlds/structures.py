@@ -98,7 +98,7 @@ def _gantry(m: _Make) -> Iterator[Mesh]:
     yield box(0.4, m.width, 0.5, m.steel, m.height + 0.7)
     face = m.site.material(sign_face((0.02, 0.1, 0.32), (0.65, 0.65, 0.65), 3.4, 2.0))
     for y in np.arange(-m.width / 2 + 2.6, m.width / 2 - 2.0, 4.4):
-        yield box(0.15, 3.4, 2.0, face, m.height).moved(-0.3, y)
+        yield box(0.15, 3.4, 2.0, face).moved(-0.3, y, m.height)
 
 
 def _crane(m: _Make) -> Iterator[Mesh]:

@@ -34,13 +34,14 @@ class SpeedProfile:
 
     def speed(self, time: Floats | float) -> Floats:
         """Metres per second at each time."""
-        return np.interp(time, self._times, self._speeds)
+        return np.asarray(np.interp(time, self._times, self._speeds))
 
     def distance(self, time: Floats | float) -> Floats:
         """Metres covered since time 0 until each time."""
         i = np.clip(np.searchsorted(self._times, time, side="right") - 1, 0, len(self._times) - 1)
         since = time - self._times[i]
-        return self._distances[i] + since * (self._speeds[i] + self.speed(time)) / 2 - self._start
+        found: Floats = self._distances[i] + since * (self._speeds[i] + self.speed(time)) / 2 - self._start
+        return found
 
     def acceleration(self, time: Floats | float) -> Floats:
         """Mean over a short while around each time, m/s^2."""
@@ -100,8 +101,13 @@ class Trajectory:
         """Nose-down angle, angle to the right and lift of a sprung body."""
         pitch = -_PITCH_PER_ACCELERATION * self.profile.acceleration(times)
         roll = _ROLL_PER_ACCELERATION * self.profile.speed(times) ** 2 * self.path.curvature(s)
-        front, rear = (sum(h * np.sin(2 * math.pi * (s + d) / w) for w, h in _BUMPS) for d in (1.35, -1.35))
+        front, rear = _bumps(s + 1.35), _bumps(s - 1.35)
         return pitch - 0.4 * (front - rear) / 2.7, roll, (front + rear) / 4
+
+
+def _bumps(s: Floats) -> Floats:
+    height: Floats = np.sum([h * np.sin(2 * math.pi * s / w) for w, h in _BUMPS], axis=0)
+    return height
 
 
 def _unit(vectors: Floats) -> Floats:

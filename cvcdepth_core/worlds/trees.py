@@ -82,7 +82,7 @@ def _branches(rng: np.random.Generator, narrow: bool, twigs: bool) -> tuple[Mesh
         reach = (0.16 if narrow else 0.42) * rng.uniform(0.6, 1.0) * math.sqrt(max(0.1, 1.15 - start))
         rise = rng.uniform(0.12, 0.3)
         base = np.array([*(lean * start * 3), start])
-        tip = base + (reach * math.cos(angle), reach * math.sin(angle), rise)
+        tip = base + np.array([reach * math.cos(angle), reach * math.sin(angle), rise])
         middle = (base + tip) / 2 + (0, 0, -0.03)
         parts.append(tube([base, middle, tip], [0.012, 0.008, 0.003], _WOOD, 5, closed=False))
         tips += [tip, middle + (tip - middle) * 0.4]

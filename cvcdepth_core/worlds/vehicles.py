@@ -305,7 +305,7 @@ def _truck(make: _Make) -> Iterator[Mesh]:
     cab = make.rng.uniform(1.9, 2.3)
     yield from _cab(make, length, width, cab)
     cargo = make.rng.uniform(0.0, 1.0)
-    colour: Colour = darker(tuple(make.rng.uniform(0.1, 0.7, 3).tolist()), 1.0)  # type: ignore[arg-type]
+    colour: Colour = darker(tuple(make.rng.uniform(0.1, 0.7, 3).tolist()), 1.0)
     white: Colour = (0.62, 0.62, 0.6)
     box_length, deck = length - cab - 0.35, 1.1
     if cargo < 0.4:

@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="folder to create")
     parser.add_argument(
         "--rig", default="nuscenes", metavar="RIG",
-        help="rig file with calibrations and mounts; or one like that of ddad, nuscenes or pandaset; or random [nuscenes]",
+        help="rig file with calibrations and mounts; ddad, nuscenes or pandaset: one like theirs; or random [nuscenes]",
     )  # fmt: skip
     parser.add_argument(
         "--world", default="random", metavar="WORLD",
@@ -169,7 +169,11 @@ def _progress(total: int, unit: str, quiet: bool) -> Iterator[Callable[[int], No
     from tqdm import tqdm
 
     with tqdm(total=total, unit=f" {unit}", disable=True if quiet else None, leave=False) as bar:
-        yield lambda done: bar.update(done - bar.n) and None
+
+        def show(done: int) -> None:
+            bar.update(done - bar.n)
+
+        yield show
 
 
 def _text(output: Path, result: dict[str, Any]) -> str:

@@ -25,7 +25,7 @@ _ATTEMPTS = 8  # seeds that are tried for a drive: now and then a vehicle would 
 class ManyDrives(NamedTuple):
     """What all drives have in common."""
 
-    count: int
+    drives: int
     rig: str
     """As for `simulate`."""
     world: str
@@ -53,8 +53,8 @@ def simulate_many(
     """
     recipe = {"version": package_version(), **choices._asdict()}
     _keep_recipe(folder, recipe)
-    missing = [number for number in range(choices.count) if not shard_path(folder, number).exists()]
-    done = choices.count - len(missing)
+    missing = [number for number in range(choices.drives) if not shard_path(folder, number).exists()]
+    done = choices.drives - len(missing)
     progress(done)
     for _ in run_all(missing, _Job(choices, folder).work, workers):
         done += 1
@@ -68,7 +68,7 @@ def shard_path(folder: Path, number: int) -> Path:
 
 
 def _keep_recipe(folder: Path, recipe: dict[str, Any]) -> None:
-    """The count may grow; all else must be as it was."""
+    """Write down what was chosen; the number of drives may grow, all else must be as it was."""
     path = folder / _RECIPE
     content = json.loads(json.dumps(recipe))
     try:
@@ -76,8 +76,8 @@ def _keep_recipe(folder: Path, recipe: dict[str, Any]) -> None:
         begun = json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
     except (OSError, ValueError) as error:
         raise OutputError(f"{folder}: cannot be used: {error}") from error
-    if begun is not None and begun | {"count": 0} != content | {"count": 0}:
-        changed = sorted(key for key in content if key != "count" and begun.get(key) != content[key])
+    if begun is not None and begun | {"drives": 0} != content | {"drives": 0}:
+        changed = sorted(key for key in content if key != "drives" and begun.get(key) != content[key])
         raise ConfigError(f"{folder}: begun with another {', '.join(changed)}; choose another folder")
     write_atomically(path, f"{json.dumps(content, indent=1)}\n".encode())
 

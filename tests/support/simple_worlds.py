@@ -28,7 +28,8 @@ LENSES = {
         d=(0.3, 0.05, 0.0005, -0.0004, 0.001, 0.35, 0.06, 0.002),
     ),
     "equidistant": Calibration(
-        width=64, height=40, distortion_model="equidistant", d=(0.02, -0.004, 0.001, 0.0), k=(36, 0, 31.2, 0, 36, 19.4, 0, 0, 1)
+        width=64, height=40, distortion_model="equidistant", k=(36, 0, 31.2, 0, 36, 19.4, 0, 0, 1),
+        d=(0.02, -0.004, 0.001, 0.0),
     ),
 }  # fmt: skip
 
@@ -43,7 +44,7 @@ class Standing:
         angle = self._yaw_rate * time
         pose = np.eye(4)
         pose[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-        pose[:3, 3] = self._start + (self._speed * time, 0.0, 0.0)
+        pose[:3, 3] = self._start + np.array([self._speed * time, 0.0, 0.0])
         return pose
 
     def poses(self, times: np.ndarray) -> np.ndarray:
@@ -55,7 +56,9 @@ class Standing:
 
 def textured(table: MaterialTable) -> int:
     """A surface with clear texture at all scales."""
-    return table.add(Material((0.4, 0.35, 0.3), coarse=Layer(Noise.CLOUDY, 6.0, 0.25), fine=Layer(Noise.ROUGH, 40.0, 0.15)))
+    return table.add(
+        Material((0.4, 0.35, 0.3), coarse=Layer(Noise.CLOUDY, 6.0, 0.25), fine=Layer(Noise.ROUGH, 40.0, 0.15))
+    )
 
 
 def daylight() -> Light:

@@ -129,7 +129,13 @@ def test_rays_of_distorted_pixels_are_those_that_opencv_projects_there():
         rays = Lens("front", calibration).through(np.array([[0.0, 0.0], [63.0, 39.0], [31.2, 19.4], [10.0, 33.0]]))
         fisheye = calibration.distortion_model == "equidistant"
         project = cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
-        found, _ = project(rays[:, None] / rays[:, None, 2:], np.zeros(3), np.zeros(3), calibration.raw_intrinsics, calibration.distortion)
+        found, _ = project(
+            rays[:, None] / rays[:, None, 2:],
+            np.zeros(3),
+            np.zeros(3),
+            calibration.raw_intrinsics,
+            calibration.distortion,
+        )
         assert found[:, 0] == pytest.approx(np.array([[0.0, 0.0], [63.0, 39.0], [31.2, 19.4], [10.0, 33.0]]), abs=1e-4)
 
 

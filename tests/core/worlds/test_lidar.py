@@ -59,7 +59,9 @@ def test_points_agree_with_the_depth_images_of_a_camera():
     camera, time, mount = Lens("front", LENSES["no distortion"]), 2.03, FORWARD.copy()
     mount[:3, 3] = 0.9, 0.0, 1.6
     swept = sweep(renderer.scene, LIDAR, way, 2.0, PERIOD, (0,))
-    points = (inverse(way.pose(time) @ mount) @ np.c_[world_points(swept.points, way.pose(2.0)), np.ones(len(swept.points))].T)[:3].T
+    points = (
+        inverse(way.pose(time) @ mount) @ np.c_[world_points(swept.points, way.pose(2.0)), np.ones(len(swept.points))].T
+    )[:3].T
     ahead = points[points[:, 2] > 1.0]
     K = LENSES["no distortion"].raw_intrinsics
     x, y = (ahead[:, i] / ahead[:, 2] * K[i, i] + K[i, 2] for i in (0, 1))
@@ -97,7 +99,9 @@ def test_measurements_are_lost_and_noisy_as_told_and_always_the_same():
 def test_the_own_vehicle_is_not_measured():
     table = MaterialTable()
     body = box(4.0, 1.7, 1.5, textured(table))
-    ground = flat_mesh([(-50, -50, 0), (50, -50, 0), (50, 50, 0), (-50, 50, 0)], [(0, 1, 2), (0, 2, 3)], textured(table))
+    ground = flat_mesh(
+        [(-50, -50, 0), (50, -50, 0), (50, 50, 0), (-50, 50, 0)], [(0, 1, 2), (0, 2, 3)], textured(table)
+    )
     renderer = Renderer(simple_world([ground], table), Standing(), body)
     swept = sweep(renderer.scene, LIDAR.model_copy(update={"nearest": 0.2}), Standing(), 0.0, PERIOD, (0,))
     assert len(swept.points)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Curves, speeds, and what a vehicle believes about its way."""
 
+import itertools
 import math
 
 import numpy as np
@@ -94,7 +95,7 @@ def test_wheels_tell_another_scale_noise_and_latency():
     late = told_motion(way, Odometry(latency=0.1), 0.0, 2.0, (0,))[-1]
     assert late.odom_T_base[0, 3] == pytest.approx(9.5)
     noisy, again, other = (told_motion(way, Odometry(noise=0.1), 0.0, 2.0, (seed,)) for seed in (1, 1, 2))
-    steps = [(inverse(a.odom_T_base) @ b.odom_T_base)[0, 3] for a, b in zip(noisy, noisy[1:], strict=False)]
+    steps = [(inverse(a.odom_T_base) @ b.odom_T_base)[0, 3] for a, b in itertools.pairwise(noisy)]
     assert np.std(steps) / np.mean(steps) == pytest.approx(0.1, rel=0.3)
     assert (noisy[-1].odom_T_base == again[-1].odom_T_base).all()
     assert (noisy[-1].odom_T_base != other[-1].odom_T_base).any()

@@ -5,12 +5,12 @@ import cv2
 import numpy as np
 import pytest
 
+from cvcdepth_core.rig.calibration import Calibration
 from cvcdepth_core.rig.poses import inverse
 from cvcdepth_core.worlds.building import build_world
 from cvcdepth_core.worlds.lenses import Lens
 from cvcdepth_core.worlds.random_world import random_world
 from cvcdepth_core.worlds.renderer import Renderer, View
-from cvcdepth_core.rig.calibration import Calibration
 
 pytest.importorskip("embreex", reason="worlds need embreex")
 
@@ -51,7 +51,11 @@ def warped_error(first: View, second: View, second_T_first: np.ndarray) -> np.nd
     inside = known & (points[..., 2] > 0.1) & (x > 0) & (y > 0) & (x < LENS.width - 1) & (y < LENS.height - 1)
     maps = x.astype(np.float32), y.astype(np.float32)
     seen = cv2.remap(np.where(np.isfinite(second.truth.depth), second.truth.depth, 1e6), *maps, cv2.INTER_NEAREST)
-    visible = inside & (np.abs(seen / z - 1) < 0.03) & ~cv2.remap(second.truth.moving.astype(np.uint8), *maps, cv2.INTER_NEAREST).astype(bool)
+    visible = (
+        inside
+        & (np.abs(seen / z - 1) < 0.03)
+        & ~cv2.remap(second.truth.moving.astype(np.uint8), *maps, cv2.INTER_NEAREST).astype(bool)
+    )
     difference = np.abs(cv2.remap(shown(second), *maps, cv2.INTER_LINEAR) - shown(first)).mean(axis=-1)
     return difference[visible]
 

@@ -15,8 +15,8 @@ from cvcdepth_core.worlds.lenses import Lens
 from cvcdepth_core.worlds.materials import FacadeParameters, Layer, Material, MaterialTable, Pattern, evaluate
 from cvcdepth_core.worlds.meshes import box, cylinder, extruded, face_normals, prism, sphere
 from cvcdepth_core.worlds.noise import Noise, noise
-from cvcdepth_core.worlds.renderer import Renderer
 from cvcdepth_core.worlds.random_world import random_world
+from cvcdepth_core.worlds.renderer import Renderer
 from cvcdepth_core.worlds.sensors import CameraLook, Sensors, random_look
 from cvcdepth_core.worlds.site import Site
 
@@ -26,7 +26,9 @@ pytest.importorskip("embreex", reason="worlds need embreex")
 @pytest.mark.parametrize("seed", range(8))
 def test_pictures_of_random_worlds_show_something_and_their_truth_is_whole(seed: int):
     looks = (random_look(Dice(seed, 1)),)
-    spec = DriveSpec(layout=two_cameras(), world=random_world(seed, None, 0.5), sensors=Sensors(looks=looks), seconds=0.2)
+    spec = DriveSpec(
+        layout=two_cameras(), world=random_world(seed, None, 0.5), sensors=Sensors(looks=looks), seconds=0.2
+    )
     drive = SimulatedDrive(spec)
     for camera in range(2):
         picture, truth = drive.shoot(camera, 0)
@@ -67,7 +69,13 @@ def test_nothing_floats_over_the_ground(seed: int):
 def test_solids_are_not_inside_out():
     outline = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)]
     profile = [(-1.0, 0.0), (1.0, 0.0), (0.8, 1.0), (-0.8, 1.0)]
-    solids = [box(1, 2, 3, 0), sphere(1.0, 0, 2), cylinder(0.5, 2.0, 0), extruded(profile, 1.5, 0), prism(outline, 0.0, 1.0, 0)]
+    solids = [
+        box(1, 2, 3, 0),
+        sphere(1.0, 0, 2),
+        cylinder(0.5, 2.0, 0),
+        extruded(profile, 1.5, 0),
+        prism(outline, 0.0, 1.0, 0),
+    ]
     for mesh in solids:
         middles = mesh.vertices[mesh.faces].mean(axis=1) - mesh.vertices.mean(axis=0)
         outward = (face_normals(mesh.vertices, mesh.faces) * middles).sum(axis=1)
@@ -135,7 +143,7 @@ def test_a_vehicle_that_starts_inside_a_wall_is_refused_by_name():
     wall = Building(at=(3.0, 0.0), road=None, size=(4.0, 6.0, 3.0))
     world = WorldSpec(buildings=(wall,), drive=Drive(at=(0.0, 0.0), road=None))
     spec = DriveSpec(layout=two_cameras(), world=world)
-    with pytest.raises(ConfigError, match="the vehicle starts inside of something: building at x 0.0, y 0.0"):
+    with pytest.raises(ConfigError, match=r"the vehicle starts inside of something: building at x 0\.0, y 0\.0"):
         SimulatedDrive(spec)
 
 

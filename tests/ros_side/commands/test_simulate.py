@@ -2,10 +2,13 @@
 """`simulate` as a command: its recording goes through check, run and evaluate; what is wrong is named in one line."""
 
 import json
+import re
+import shlex
 import sys
 from pathlib import Path
 
 import pytest
+from repository import ROOT
 from simple_worlds import short_drive, street_spec, two_cameras
 
 from cvcdepth_core.rig.rig import save_rig_layout
@@ -56,8 +59,9 @@ def test_run_and_evaluate_work_on_it_without_options(drive: Path, tmp_path: Path
 def test_its_world_can_be_edited_and_simulated_again(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     world = load_world(drive / "world.yaml")
     save_world(tmp_path / "bare.yaml", world.model_copy(update={"trees": (), "vehicles": ()}))
-    options = ["--rig", drive / "rig.yaml", "--world", tmp_path / "bare.yaml", "--seconds", "0.1", "--look", "clean", "--workers", "1"]
-    assert main(["simulate", *map(str, options), "-o", str(tmp_path / "again"), "--json", "--no-lidar", "--truth", "none"]) == 0
+    files = ["--rig", drive / "rig.yaml", "--world", tmp_path / "bare.yaml", "-o", tmp_path / "again"]
+    options = shlex.split("--seconds 0.1 --look clean --workers 1 --json --no-lidar --truth none")
+    assert main(["simulate", *map(str, files), *options]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["sets"] == 1
     assert "saloon" not in result["objects"]
@@ -65,9 +69,11 @@ def test_its_world_can_be_edited_and_simulated_again(drive: Path, tmp_path: Path
 
 
 def test_many_drives_become_shards(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    options = "--rig random --world rural --many 2 --seconds 0.1 --size 48x32 --samples 1 --workers 1 --json".split()
+    options = shlex.split(
+        "--rig random --world rural --many 2 --seconds 0.1 --size 48x32 --samples 1 --workers 1 --json"
+    )
     assert main(["simulate", *options, "-o", str(tmp_path / "shards")]) == 0
-    assert json.loads(capsys.readouterr().out)["count"] == 2
+    assert json.loads(capsys.readouterr().out)["drives"] == 2
     assert len({Shard(path).layout for path in (tmp_path / "shards").glob("*.shard.zip")}) == 2
 
 
@@ -87,21 +93,25 @@ def test_rigs_like_those_of_data_sets_are_complete(name: str):
         ("--world moon", "world moon: neither a file, nor a seed, nor a kind of place; kinds are city, suburb"),
         ("--world {files}/parts.yaml", "parts.yaml: statues: Extra inputs are not permitted"),
         ("--sensors {files}/sensors.yaml", "sensors.yaml: rate: Input should be greater than 0"),
-        ("--rig {files}/rig.yaml --world {files}/walled.yaml", "the vehicle starts inside of something: building at x "),
-        ("--rig {files}/folded.yaml --world {files}/world.yaml", "camera front: plumb_bob with d = .* cannot be inverted"),
+        (
+            "--rig {files}/rig.yaml --world {files}/walled.yaml",
+            "the vehicle starts inside of something: building at x ",
+        ),
+        (
+            "--rig {files}/folded.yaml --world {files}/world.yaml",
+            "camera front: plumb_bob with d = .* cannot be inverted",
+        ),
     ],
 )
 def test_what_is_wrong_is_named_in_one_line(
     arguments: str, message: str, files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    import re
-
-    from repository import ROOT
-
     (files / "parts.yaml").write_text("statues: []\n")
     (files / "sensors.yaml").write_text("rate: 0\n")
     street = street_spec()
-    save_world(files / "walled.yaml", street.model_copy(update={"drive": street.drive.model_copy(update={"at": (5.0, 9.0)})}))
+    save_world(
+        files / "walled.yaml", street.model_copy(update={"drive": street.drive.model_copy(update={"at": (5.0, 9.0)})})
+    )
     folded = two_cameras().cameras[0].calibration.model_copy(update={"d": (-0.9, 0.1, 0.0, 0.0, 0.0)})
     save_rig_layout(files / "folded.yaml", two_cameras(calibration=folded))
     given = arguments.format(config=ROOT / "config" / "rigs", files=files).split()
@@ -119,9 +129,19 @@ def test_without_the_ray_engine_the_extra_is_named(
 
 @pytest.mark.parametrize(
     "arguments",
-    ["", "-o x --size 640", "-o x --size 5x5", "-o x --quality 0", "-o x --workers 0", "-o x --stagger 1", "-o x --look odd",
-     "-o x --many 2 --images raw", "-o x --many 2 --no-lidar", "-o x --body varied"],
-)  # fmt: skip
+    [
+        "",
+        "-o x --size 640",
+        "-o x --size 5x5",
+        "-o x --quality 0",
+        "-o x --workers 0",
+        "-o x --stagger 1",
+        "-o x --look odd",
+        "-o x --many 2 --images raw",
+        "-o x --many 2 --no-lidar",
+        "-o x --body varied",
+    ],
+)
 def test_wrong_use_ends_with_2(arguments: str, capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit) as ended:
         main(["simulate", *arguments.split()])

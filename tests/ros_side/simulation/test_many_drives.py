@@ -14,7 +14,7 @@ from cvcdepth_ros.simulation.many import ManyDrives, drive_spec, shard_path, sim
 pytest.importorskip("embreex", reason="worlds need embreex")
 
 CHOICES = ManyDrives(
-    count=2, rig="random", world="rural", size=(48, 32), seed=4, seconds=0.2, rate=10.0, samples=1, look="varied",
+    drives=2, rig="random", world="rural", size=(48, 32), seed=4, seconds=0.2, rate=10.0, samples=1, look="varied",
     odometry="exact", body="varied", stagger=None, readout=0.0, images="png", quality=90,
 )  # fmt: skip
 
@@ -57,7 +57,7 @@ def test_drives_differ_in_rig_world_and_camera():
 
 
 def test_more_drives_are_added_and_other_choices_refused(folder: Path, tmp_path: Path):
-    one = CHOICES._replace(count=1)
+    one = CHOICES._replace(drives=1)
     simulate_many(one, tmp_path, workers=1)
     before = shard_path(tmp_path, 0).stat().st_mtime_ns
     seen: list[int] = []

@@ -118,7 +118,9 @@ def test_the_rig_that_is_found_in_the_recording_is_the_one_that_was_simulated(re
 def test_pictures_and_truth_are_those_of_the_drive_at_their_stamps(recorded: Path, drive: SimulatedDrive):
     for index, camera in enumerate(drive.rig.cameras):
         pictures = messages(recorded, SPEC.layout.cameras[index].image_topic)
-        depths, objects, moving = (messages(recorded, truth_topic(camera.name, w)) for w in ("depth", "objects", "moving"))
+        depths, objects, moving = (
+            messages(recorded, truth_topic(camera.name, w)) for w in ("depth", "objects", "moving")
+        )
         assert len(pictures) == len(depths) == SPEC.sets == 3
         for number in range(3):
             shot = drive.shoot(index, number)
