@@ -9,7 +9,19 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from cvcdepth_core.errors import CvcDepthError, NotPromotedError
-from cvcdepth_ros.commands import bench, check, evaluate, export, finetune, import_weights, inspect, play, rig, run
+from cvcdepth_ros.commands import (
+    bench,
+    check,
+    evaluate,
+    export,
+    finetune,
+    import_weights,
+    inspect,
+    play,
+    rig,
+    run,
+    simulate,
+)
 from cvcdepth_ros.installation import package_version
 
 PROGRAM = "cvcdepth"
@@ -42,6 +54,7 @@ COMMANDS: Mapping[str, Command] = {
     "play": play,
     "bench": bench,
     "export": export,
+    "simulate": simulate,
 }
 
 

@@ -48,6 +48,7 @@ CORE_ROOMS = {
     "estimator": f"{_GROUND} rig images networks engines",
     "pointcloud": f"{_GROUND} rig",
     "visualization": f"{_GROUND} rig images",
+    "worlds": f"{_GROUND} rig",
 }
 ROS_ROOMS = {
     "installation": "",
@@ -64,12 +65,13 @@ ROS_ROOMS = {
     "training_data": "settings recently_used bags kept messages surround_sets recordings",
     "evaluation": "installation settings console bags kept messages surround_sets recordings",
     "node": "settings bags messages surround_sets live",
+    "simulation": "installation bags messages",
     "finetuning": "installation settings console bags kept surround_sets recordings checks training_data evaluation",
     "end_to_end": "installation console bags messages surround_sets live node",
     "bench": "messages surround_sets live node",
     "reports": "console messages evaluation finetuning",
     "commands": "installation settings console bags kept messages surround_sets recordings live checks training_data "
-    "evaluation node finetuning end_to_end bench reports",
+    "evaluation node simulation finetuning end_to_end bench reports",
     "demo": "installation settings console bags messages surround_sets recordings end_to_end reports",
     "bag_replay": "installation commands",
     "surround_depth_node": "messages live node",

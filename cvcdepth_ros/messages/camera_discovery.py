@@ -29,7 +29,7 @@ _INFO = "camera_info"
 _TRANSPORTS = {"compressed", "ffmpeg", "h264", "h265", "hevc", "foxglove", "video", "encoded"}
 _NO_PICTURES = {"compresseddepth", "theora", "zstd"}
 _MEASURES = {"depth", "disparity", "confidence", "flow", "normals"}
-_MEASURED_NAMESPACES = {"depth", "disparity"}
+_MEASURED_NAMESPACES = {"depth", "disparity", "truth"}  # the last of `simulate`
 # What perception draws into pictures, or makes of them, in the camera's own namespace as a rule.
 _DRAWN = re.compile(
     "mask(s|ed)?|seg(mentation|mented)?|semantics?|label(s|led|ed)?|instances?|panoptic|debug|overlays?|annotat(ed|ions?)|"
