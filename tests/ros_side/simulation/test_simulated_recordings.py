@@ -17,6 +17,7 @@ from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.messages.conversion import picture_from_message, stamp_ns
 from cvcdepth_ros.recordings.lidar import LidarSweeps
 from cvcdepth_ros.recordings.rig import RecordedRig, discover_rig
+from cvcdepth_ros.settings import LIDAR_TOLERANCE
 from cvcdepth_ros.simulation.recording import record
 from cvcdepth_ros.simulation.set_messages import Form, set_messages, stamp_of, truth_topic
 
@@ -148,7 +149,7 @@ def test_lidar_points_lie_in_the_depth_images_of_the_recording_to_1e_4(recorded:
         motion = recorded_rig.vehicle_motion()
         assert motion is not None
         assert motion.topic == "/tf"
-        sweeps = LidarSweeps(["/lidar/points"], "base_link", recorded_rig.transforms, motion)
+        sweeps = LidarSweeps(["/lidar/points"], "base_link", recorded_rig.transforms, motion, LIDAR_TOLERANCE)
         for message in recording.messages(["/tf", "/lidar/points"]):
             content = recording.deserialize(message)
             motion.add(content) if message.topic == "/tf" else sweeps.add(message.topic, content)
