@@ -377,7 +377,7 @@ def test_an_unknown_encoding_fails(check, sample):
     raw = recordings.with_raw_images(recordings.sample_entries(2), "bgr8")
     found = check(recordings.changed(raw, "/camera/left/image_raw", rename))["encodings"]
     assert found["status"] == "failed"
-    assert "yuv422" in found["finding"]
+    assert "yuv444" in found["finding"]
 
 
 def exchanged_poses(first: str, second: str):

@@ -379,9 +379,9 @@ def test_an_unknown_encoding_is_named(graph, messages, rig_content, tmp_path):
 
     def refused() -> bool:
         for message in messages["/camera/left/image_raw/compressed"]:
-            image = Image(header=message.header, height=540, width=960, encoding="yuv422", step=1920)
+            image = Image(header=message.header, height=540, width=960, encoding="yuv444", step=1920)
             publisher.publish(image)
-        return "encoding 'yuv422' is not supported" in message_of(graph, "camera left")
+        return "encoding 'yuv444' is not supported" in message_of(graph, "camera left")
 
     feed.publish_until(refused, "the refusal")
 
