@@ -11,7 +11,6 @@ from cvcdepth_core.errors import RecordingError
 POINT_CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
 
 _FLOAT_TYPES = {7: "f4", 8: "f8"}  # sensor_msgs/PointField.FLOAT32 and FLOAT64
-_COLOURS = {"rgb", "rgba"}
 
 
 def points_from_message(message: Any, topic: str) -> NDArray[np.float64]:
@@ -26,11 +25,6 @@ def points_from_message(message: Any, topic: str) -> NDArray[np.float64]:
     returned = np.isfinite(xyz).all(axis=1) & xyz.any(axis=1)
     points: NDArray[np.float64] = xyz[returned]
     return points
-
-
-def has_colours(message: Any) -> bool:
-    """Whether the points of a PointCloud2 have colours, as those of clouds that were made from camera images do."""
-    return any(field.name in _COLOURS for field in message.fields)
 
 
 def _check_size(message: Any, size: int, topic: str) -> None:

@@ -8,7 +8,7 @@ import pytest
 from clouds import POINTS, cloud
 
 from cvcdepth_core.errors import RecordingError
-from cvcdepth_ros.messages.point_clouds import has_colours, points_from_message
+from cvcdepth_ros.messages.point_clouds import points_from_message
 
 
 @pytest.mark.parametrize("kind", ["f", "d"])
@@ -65,10 +65,3 @@ def test_rows_that_overlap_are_refused():
     broken.row_step = 3
     with pytest.raises(RecordingError, match="row_step is 3 bytes, but 2 points of 12 need 24"):
         points_from_message(broken, "/lidar")
-
-
-@pytest.mark.parametrize(("name", "expected"), [("rgb", True), ("rgba", True), ("intensity", False), ("ring", False)])
-def test_clouds_with_colours_are_told_from_those_of_a_lidar(name, expected):
-    message = cloud()
-    message.fields[0].name = name
-    assert has_colours(message) is expected
