@@ -10,6 +10,7 @@ from typing import IO, NamedTuple
 
 import lz4.frame  # type: ignore[import-untyped]
 
+from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_ros.bags.topics import MAX_BLOCK_BYTES
 
 DAMAGE = (ValueError, LookupError, struct.error, EOFError, RuntimeError, OSError, MemoryError)
@@ -17,7 +18,6 @@ DAMAGE = (ValueError, LookupError, struct.error, EOFError, RuntimeError, OSError
 
 _MAX_HEADER_BYTES = 2**20  # real ones take some hundred
 _MAX_CHUNK_RECORDS = 2**20
-_NANOSECONDS = 10**9
 
 
 class Op(IntEnum):
@@ -56,7 +56,7 @@ class Record(NamedTuple):
         if len(content) != 8:
             raise ValueError(f"field '{name}' has {len(content)} bytes, want 8")
         seconds, nanoseconds = struct.unpack("<II", content)
-        return int(seconds) * _NANOSECONDS + int(nanoseconds)
+        return int(seconds) * NANOSECONDS + int(nanoseconds)
 
     def text(self, name: str) -> str:
         """Return a field as text, empty where it is missing; comments in definitions are of any character set."""

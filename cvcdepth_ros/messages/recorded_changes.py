@@ -10,13 +10,13 @@ import numpy as np
 from cvcdepth_core.errors import RecordingError, RigError
 from cvcdepth_core.rig.calibration import Calibration
 from cvcdepth_core.rig.rig_file import RigLayout
+from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_ros.bags import RecordedMessage, Recording
 from cvcdepth_ros.messages.calibration_changes import describe_change
 from cvcdepth_ros.messages.camera_info import is_uncalibrated, read_camera_info
 
 _SAMPLES = 9
 _SHORTEST_NS = 10_000_000
-_NANOSECONDS = 10**9
 
 
 class _Sample(NamedTuple):
@@ -26,9 +26,9 @@ class _Sample(NamedTuple):
 
 def moment_of(time: int, recording: Recording) -> str:
     """Say when something was, `time` (ns) being a stamp or log time: in seconds from the recording's beginning."""
-    if recording.start - _NANOSECONDS <= time <= recording.end + _NANOSECONDS:
-        return f"{(time - recording.start) / _NANOSECONDS:.3f} s after the beginning"
-    return f"at {time / _NANOSECONDS:.3f} s of its clock"
+    if recording.start - NANOSECONDS <= time <= recording.end + NANOSECONDS:
+        return f"{(time - recording.start) / NANOSECONDS:.3f} s after the beginning"
+    return f"at {time / NANOSECONDS:.3f} s of its clock"
 
 
 def find_calibration_changes(
