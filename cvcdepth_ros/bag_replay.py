@@ -64,8 +64,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Wrong use ends by SystemExit(2).
     """
     program = "bag_replay" if Path(sys.argv[0]).name == "bag_replay" else PROGRAM
+    given = sys.argv[1:] if arguments is None else arguments
     try:
-        parsed = build_parser(program).parse_args(arguments)
+        if not given:  # as `ros2` does
+            build_parser(program).print_help()
+            return 0
+        parsed = build_parser(program).parse_args(given)
         parsed.execute(parsed)
         sys.stdout.flush()
     except BrokenPipeError:

@@ -101,8 +101,8 @@ class RigLayout(BaseModel):
     @model_validator(mode="after")
     def _check(self) -> "RigLayout":
         names = self.names
-        if len(names) < 2:
-            raise ValueError(f"a surround rig needs at least two cameras, found {len(names)}: {', '.join(names)}")
+        if not names:
+            raise ValueError("cameras: a rig needs at least one camera, found none")
         repeated = sorted({name for name in names if names.count(name) > 1})
         if repeated:
             raise ValueError(f"two cameras are called {', '.join(repeated)}")

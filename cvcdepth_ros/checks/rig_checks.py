@@ -38,16 +38,19 @@ def check_cameras(context: CheckContext) -> CheckResult:
         remedy = "record its images, or give a rig file without this camera (--rig)"
         return CheckResult("failed", f"{found}; no image beside {', '.join(values['without_images'])}", remedy, values)
     if context.refusal is not None:
-        remedy = "record a camera_info beside the images of at least two cameras, in one namespace each"
+        remedy = "record a camera_info beside the images of each camera, in one namespace each"
         remedy += cameras.offers and f"; {cameras.offers}"
-        reason = "two are needed" if len(names) < 2 else context.refusal
-        return CheckResult("failed", f"{found}; {reason}", remedy, values)
+        return CheckResult("failed", f"{found}; {context.refusal}" if names else found, remedy, values)
     if values["without_camera_info"]:
         remedy = cameras.offers or "record its camera_info, or give its calibration in a rig file (--rig)"
         finding = f"{found}; no camera_info beside {', '.join(values['without_camera_info'])}"
         return CheckResult("warning", finding, remedy, values)
     told = "; ".join([*cameras.choices, *cameras.left_out][:_MAX_LISTED])
-    return CheckResult("passed", f"{found}; {told}" if told else found, values=values)
+    found = f"{found}; {told}" if told else found
+    if len(names) == 1:
+        remedy = "it is enough for run, node and evaluate; metric scale is learned from two cameras that overlap"
+        return CheckResult("warning", found, remedy, values)
+    return CheckResult("passed", found, values=values)
 
 
 def check_camera_infos(context: CheckContext) -> CheckResult:
@@ -126,4 +129,4 @@ def _judged(problems: list[str], remedy: str, passed: str, values: Mapping[str, 
 
 
 def _without_cameras() -> CheckResult:
-    return CheckResult("skipped", "needs at least two cameras and transforms without contradictions")
+    return CheckResult("skipped", "needs cameras, and transforms without contradictions")

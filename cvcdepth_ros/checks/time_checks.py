@@ -47,7 +47,7 @@ def check_sets(context: CheckContext) -> CheckResult:
     """Match the images as the node does; where sets are missing, say which camera is in the way and what would help."""
     layout = context.layout
     if layout is None:
-        return CheckResult("skipped", "needs at least two cameras")
+        return CheckResult("skipped", "needs cameras")
     received = {name: context.stamps(name).size for name in layout.names}
     silent = [name for name, count in received.items() if not count]
     if silent:

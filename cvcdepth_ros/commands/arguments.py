@@ -16,6 +16,7 @@ from cvcdepth_ros.installation import share_directory
 from cvcdepth_ros.settings import ModelSettings
 
 if TYPE_CHECKING:
+    from cvcdepth_core.rig.rig_file import RigLayout
     from cvcdepth_ros.bags import Recording
 
 SettingsT = TypeVar("SettingsT", bound=ModelSettings)
@@ -34,6 +35,21 @@ def add_recordings(parser: argparse.ArgumentParser, required: bool = True) -> No
         metavar="BAG",
         help="rosbag2 folder, or .mcap, .db3 or ROS 1 .bag file; folder of these, glob, or URL (s3://bucket/drive.mcap)",
     )
+
+
+def add_rig(parser: argparse.ArgumentParser, default: str = "the cameras found in each recording") -> None:
+    """Declare the rig file, and the vehicle's frame where there is none; for `rig_layout`."""
+    parser.add_argument("--rig", type=Path, metavar="FILE", help=f"rig file [{default}]")
+    parser.add_argument(
+        "--base-frame", metavar="FRAME", default="base_link", help="without --rig: the vehicle's frame [base_link]"
+    )
+
+
+def rig_layout(arguments: argparse.Namespace) -> "RigLayout | None":
+    """Return the rig file's content; None where none is named. RigError says what is wrong with it."""
+    from cvcdepth_core.rig.rig_file import load_rig_layout
+
+    return load_rig_layout(arguments.rig) if arguments.rig else None
 
 
 def add_quiet(parser: argparse.ArgumentParser) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cvcdepth_core.errors import RecordingError
-from cvcdepth_ros.commands.arguments import add_recording, add_settings, settings_from
+from cvcdepth_ros.commands.arguments import add_recording, add_rig, add_settings, rig_layout, settings_from
 from cvcdepth_ros.console import positive
 from cvcdepth_ros.installation import package_version
 from cvcdepth_ros.settings import ModelSettings
@@ -38,6 +38,7 @@ _CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_recording(parser)
+    add_rig(parser, "the cameras found in the recording")
     add_settings(parser, ModelSettings)
     parser.add_argument("--seconds", type=positive, default=10.0, metavar="S", help="recorded seconds to play [10]")
     parser.add_argument("--rate", type=positive, default=1.0, metavar="R", help="how many times real time [1]")
@@ -48,11 +49,13 @@ def execute(arguments: argparse.Namespace) -> None:
     """Measure and print."""
     from cvcdepth_ros.bags import open_recording
     from cvcdepth_ros.end_to_end.repeated_recording import write_repeated
-    from cvcdepth_ros.recordings.rig import discover_rig
+    from cvcdepth_ros.recordings.rig import RecordedRig
 
     model = settings_from(arguments, ModelSettings)
     with tempfile.TemporaryDirectory(prefix="cvcdepth_bench_") as folder, open_recording(arguments.recording) as source:
-        layout = discover_rig(source)
+        given = rig_layout(arguments)
+        recorded = RecordedRig.from_recording(source, given, arguments.base_frame)
+        layout = recorded.layout if given is None else recorded.completed().layout
         played = Path(folder) / "played"
         write_repeated(source, layout, played, arguments.seconds)
         names = ["node"] if arguments.no_baseline else list(_NODES)

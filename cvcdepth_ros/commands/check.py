@@ -6,7 +6,6 @@ import textwrap
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cvcdepth_core.errors import CvcDepthError, RecordingError
@@ -15,11 +14,13 @@ from cvcdepth_ros.commands.arguments import (
     add_lidar,
     add_quiet,
     add_recordings,
+    add_rig,
     add_skip,
     add_window,
     lidar_topics,
     recording_progress,
     refuse_unknown_checks,
+    rig_layout,
     window_ns,
 )
 from cvcdepth_ros.console import positive, print_result
@@ -64,10 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     tolerance = MatchingSettings().tolerance
     add_recordings(parser)
-    parser.add_argument("--rig", type=Path, metavar="FILE", help="rig file [the cameras found in each recording]")
-    parser.add_argument(
-        "--base-frame", default="base_link", metavar="FRAME", help="without --rig: the vehicle's frame [base_link]"
-    )
+    add_rig(parser)
     parser.add_argument(
         "--tolerance",
         type=positive,
@@ -84,11 +82,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(arguments: argparse.Namespace) -> None:
     """Check each recording; RecordingError at the end when a check failed."""
-    from cvcdepth_core.rig.rig_file import load_rig_layout
     from cvcdepth_ros.bags import find_recordings
 
     refuse_unknown_checks(arguments)
-    layout = load_rig_layout(arguments.rig) if arguments.rig else None
+    layout = rig_layout(arguments)
     checked = [_checked(location, layout, arguments) for location in find_recordings(arguments.recordings)]
     result = {"recordings": [_json(one) for one in checked]}
     print_result(result, "\n\n".join(_text(one) for one in checked), arguments.json)

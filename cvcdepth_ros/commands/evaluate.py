@@ -15,9 +15,11 @@ from cvcdepth_ros.commands.arguments import (
     add_lidar,
     add_quiet,
     add_recordings,
+    add_rig,
     add_settings,
     add_window,
     lidar_topics,
+    rig_layout,
     settings_from,
 )
 from cvcdepth_ros.console import print_result, progress_bar, table, warn
@@ -61,10 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--compare", nargs=2, type=Path, metavar=("A", "B"), help="two metrics.json: is B better than A?"
     )
     add_lidar(parser)
-    parser.add_argument("--rig", type=Path, metavar="FILE", help="rig file [the cameras found in each recording]")
-    parser.add_argument(
-        "--base-frame", metavar="FRAME", default="base_link", help="without --rig: the vehicle's frame [base_link]"
-    )
+    add_rig(parser)
     add_window(parser)
     parser.add_argument(
         "--workers", type=_workers, metavar="N", help="processes, a recording each [1; with --ray as many as CPUs]"
@@ -176,12 +175,11 @@ def _pool(arguments: argparse.Namespace, settings: EvaluationSettings) -> "Abstr
 
 
 def _jobs(arguments: argparse.Namespace, settings: EvaluationSettings) -> list[EvaluationJob]:
-    from cvcdepth_core.rig.rig_file import load_rig_layout
     from cvcdepth_ros.bags import find_recordings
 
     locations = find_recordings(arguments.recordings)
     names = unique_names([(location.name, str(location)) for location in locations])
-    layout = load_rig_layout(arguments.rig) if arguments.rig else None
+    layout = rig_layout(arguments)
     lidar, window = lidar_topics(arguments), (arguments.start, arguments.duration)
     job = EvaluationJob("", "", settings, layout, arguments.base_frame, lidar, *window)
     return [replace(job, name=name, path=str(path)) for name, path in zip(names, locations, strict=True)]

@@ -39,7 +39,7 @@ def evaluation_text(result: EvaluationResult, folder: Path) -> str:
     blocks = [_score_table(result) if has_truth else _label_free_table(result)]
     if len(result.recordings) > 1:
         blocks.append(_recordings_table(result, has_truth))
-    return "\n\n".join(filter(None, [*blocks, "\n".join(map(paragraph, _lines(result, folder)))]))
+    return "\n\n".join(filter(None, [*blocks, "\n".join(_lines(result, folder))]))
 
 
 def _lines(result: EvaluationResult, folder: Path) -> Iterator[str]:
@@ -47,7 +47,7 @@ def _lines(result: EvaluationResult, folder: Path) -> Iterator[str]:
     reasons = {found.summary["no_flat_ground"]: None for found in result.recordings if found.summary["no_flat_ground"]}
     yield from (f"no flat ground to compare with: {reason}; see --ground-height" for reason in reasons)
     for seen in result.trained_on:
-        yield (
+        yield paragraph(
             f"{seen.recording}: the model was trained on {seen.sets} of these {seen.scored} sets ({seen.trained_as}): "
             "its scores here do not tell how good it is elsewhere"
         )

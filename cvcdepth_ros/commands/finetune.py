@@ -12,9 +12,11 @@ from cvcdepth_ros.commands.arguments import (
     add_lidar,
     add_quiet,
     add_recordings,
+    add_rig,
     add_skip,
     lidar_topics,
     refuse_unknown_checks,
+    rig_layout,
     training_file,
 )
 from cvcdepth_ros.console import print_result, table, warn
@@ -55,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--from", dest="start", metavar="CHECKPOINT", help="weights to start from; 'default' are the package's own"
     )
     start.add_argument("--from-scratch", action="store_true", help="start from random weights")
-    parser.add_argument("--rig", type=Path, metavar="FILE", help="rig file [the cameras found in each recording]")
+    add_rig(parser)
     parser.add_argument(
         "--no-masks", action="store_true", help="do not look for the vehicle's own body in the recordings"
     )
@@ -116,7 +118,6 @@ def _fine_tuned(
 def _job(arguments: argparse.Namespace, config: "TrainingConfig") -> "FinetuneJob":
     from cvcdepth_core.model_choices import checkpoint_path
     from cvcdepth_core.networks.checkpoint import load_checkpoint
-    from cvcdepth_core.rig.rig_file import load_rig_layout
     from cvcdepth_ros.bags import find_recordings
     from cvcdepth_ros.finetuning.preparation import Source
     from cvcdepth_ros.finetuning.run import FinetuneJob
@@ -124,11 +125,12 @@ def _job(arguments: argparse.Namespace, config: "TrainingConfig") -> "FinetuneJo
 
     source = Source(
         find_recordings(arguments.recordings),
-        load_rig_layout(arguments.rig) if arguments.rig else None,
+        rig_layout(arguments),
         MatchingSettings.model_validate({"tolerance": config.recordings.tolerance}),
         tuple(arguments.skip),
         not arguments.no_masks,
         lidar_topics(arguments),
+        arguments.base_frame,
     )
     start = None if arguments.start is None else load_checkpoint(checkpoint_path(arguments.start))
     return FinetuneJob(source, config, arguments.output, start, arguments.device, arguments.quiet)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cvcdepth_core.errors import ConfigError
-from cvcdepth_ros.commands.arguments import add_json, add_recording, refuse_to_overwrite
+from cvcdepth_ros.commands.arguments import add_json, add_recording, add_rig, refuse_to_overwrite, rig_layout
 from cvcdepth_ros.console import print_result, table, warn
 from cvcdepth_ros.installation import package_version
 
@@ -22,7 +22,7 @@ SUMMARY = """Write a rig file from a recording.
 Finds the cameras, takes their calibrations from camera_info and their poses from /tf_static, orders them
 counter-clockwise around the vehicle from the front one, and computes which of them see the same space. With --masks it
 finds where a camera sees the vehicle itself, which stands still in the picture while the scene moves, and writes a PNG
-for it beside the rig file."""
+for it beside the rig file. With --rig, a file that names the cameras only (config/rigs/) is completed."""
 EXAMPLES: tuple[str, ...] = (
     "rig drive.mcap",
     "rig drive/ -o rigs/shuttle.yaml --base-frame base_footprint --anchor front",
@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("rig.yaml"), metavar="FILE", help="rig file to write [rig.yaml]"
     )
-    parser.add_argument("--base-frame", default="base_link", metavar="FRAME", help="the vehicle's frame [base_link]")
+    add_rig(parser, "the cameras found in the recording")
     parser.add_argument("--anchor", metavar="NAME", help="camera whose stamp a set carries [the front one]")
     parser.add_argument("--masks", action="store_true", help="find the vehicle's own body (reads the whole recording)")
     parser.add_argument("--force", action="store_true", help="overwrite the rig file and its masks")
@@ -51,7 +51,9 @@ def execute(arguments: argparse.Namespace) -> None:
     if not arguments.force:
         refuse_to_overwrite(arguments.output)
     with open_recording(arguments.recording) as recording:
-        recorded = RecordedRig.from_recording(recording, base_frame=arguments.base_frame)
+        given = rig_layout(arguments)
+        recorded = RecordedRig.from_recording(recording, given, arguments.base_frame)
+        recorded = recorded if given is None else recorded.completed()
         layout = recorded.layout.model_copy(update={"anchor": _anchor(recorded.layout, arguments.anchor)})
         path, shares = recording.path, dict[str, float]()
         for note in recorded.notes():

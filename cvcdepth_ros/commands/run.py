@@ -14,7 +14,16 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from cvcdepth_core.errors import RecordingError
 from cvcdepth_core.files import write_json
-from cvcdepth_ros.commands.arguments import add_json, add_recording, add_settings, add_window, settings_from, window_ns
+from cvcdepth_ros.commands.arguments import (
+    add_json,
+    add_recording,
+    add_rig,
+    add_settings,
+    add_window,
+    rig_layout,
+    settings_from,
+    window_ns,
+)
 from cvcdepth_ros.console import print_result, progress_bar, table, warn
 from cvcdepth_ros.installation import package_version
 from cvcdepth_ros.settings import MatchingSettings, MissingCameraSettings, ModelSettings, OutputSettings
@@ -51,10 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_recording(parser)
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="folder to create")
-    parser.add_argument("--rig", type=Path, metavar="FILE", help="rig file [the cameras found in the recording]")
-    parser.add_argument(
-        "--base-frame", metavar="FRAME", default="base_link", help="without --rig: the vehicle's frame [base_link]"
-    )
+    add_rig(parser, "the cameras found in the recording")
     add_window(parser)
     add_settings(parser, RunSettings)
     parser.add_argument(
@@ -109,11 +115,9 @@ def _trace(path: Path | None) -> "Iterator[StageLatencies]":
 
 
 def _recorded_rig(arguments: argparse.Namespace, recording: "Recording") -> "RecordedRig":
-    from cvcdepth_core.rig.rig_file import load_rig_layout
     from cvcdepth_ros.recordings.rig import RecordedRig
 
-    layout = load_rig_layout(arguments.rig) if arguments.rig else None
-    return RecordedRig.from_recording(recording, layout, arguments.base_frame)
+    return RecordedRig.from_recording(recording, rig_layout(arguments), arguments.base_frame)
 
 
 def _record(

@@ -42,6 +42,8 @@ class Source:
     """Whether to look for the vehicle's own body where the rig has no mask."""
     lidar: tuple[str, ...] | None = None
     """Topics of the LiDARs; none: the vehicle has none; None: those of each recording."""
+    base_frame: str = "base_link"
+    """The vehicle's frame, where `layout` is None."""
 
 
 @dataclass
@@ -66,7 +68,7 @@ def prepare(source: Source, run: Path) -> Prepared:
             checks = check_results(path, source, run)
             problems = [found for found in checks if found.result.status in ("failed", "warning")]
             _refuse(path, problems)
-            index = load_index(path, run / _INDEX_FOLDER, source.matching, source.layout)
+            index = load_index(path, run / _INDEX_FOLDER, source.matching, source.layout, source.base_frame)
             prepared.indexes.append(index)
             prepared.warnings += [_describe_finding(path, problem) for problem in problems]
             prepared.warnings += [f"{path}: {loss}" for loss in index.losses]
@@ -82,7 +84,9 @@ def prepare(source: Source, run: Path) -> Prepared:
 def check_results(path: Location, source: Source, run: Path) -> list[NumberedResult]:
     """Return the results of `cvcdepth check`, found now, or before in the very same recording and rig."""
     matching, layout = source.matching, source.layout
-    options = CheckOptions(tolerance=matching.tolerance, queue_size=matching.queue_size, lidar=source.lidar)
+    options = CheckOptions(
+        tolerance=matching.tolerance, queue_size=matching.queue_size, base_frame=source.base_frame, lidar=source.lidar
+    )
     work = {
         "version": package_version(),
         "files": file_identities(path),

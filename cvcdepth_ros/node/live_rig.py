@@ -17,18 +17,21 @@ from cvcdepth_ros.messages.rig_assembly import RigAssembler
 from cvcdepth_ros.messages.transforms import TransformTree
 from cvcdepth_ros.node.subscriptions import StaticTransformInput, topic_types
 
-_SETTLING_SECONDS = 3.0
+_SETTLING_SECONDS, _SETTLING_SECONDS_ALONE = 3.0, 10.0
 _SHOWN = 3
 
 
 class LiveRigDiscovery:
-    """Watches the graph until its cameras stay the same for three seconds and each is calibrated and has a pose."""
+    """Watches the graph until its cameras stay the same for three seconds and each is calibrated and has a pose.
+
+    A single camera is waited with for ten seconds.
+    """
 
     def __init__(self, node: Node, base_frame: str, min_cameras: int) -> None:
         """Start listening. ConfigError where tf2_msgs is not installed: then nothing tells the cameras' poses."""
         self._node = node
         self._base_frame = base_frame
-        self._least = max(2, min_cameras)
+        self._least = max(1, min_cameras)
         self._entries: tuple[CameraEntry, ...] = ()
         self._unpaired: list[str] = []
         self._assembler: RigAssembler | None = None
@@ -44,7 +47,9 @@ class LiveRigDiscovery:
         Its layout leaves calibrations and poses open, so that they can change later.
         """
         self._watch_graph()
-        settled = time.monotonic() - self._changed > _SETTLING_SECONDS
+        # Drivers start one after the other: a single camera mostly has others still to come.
+        patience = _SETTLING_SECONDS if len(self._entries) > 1 else _SETTLING_SECONDS_ALONE
+        settled = time.monotonic() - self._changed > patience
         if not settled or self._assembler is None or self._assembler.problems():
             return None
         try:
@@ -62,7 +67,8 @@ class LiveRigDiscovery:
         """Return what is still missing, and the remedy."""
         if len(self._entries) < self._least:
             names = ", ".join(entry.name for entry in self._entries) or "none"
-            want = f"at least {self._least} cameras with image and camera_info topics"
+            cameras = "1 camera" if self._least == 1 else f"{self._least} cameras"
+            want = f"at least {cameras} with image and camera_info topics"
             return f"waiting for {want}, found {names}{self._hint()}"
         problems = self._assembler.problems() if self._assembler else {}
         if not problems:

@@ -45,8 +45,8 @@ class RecordedRig:
     ) -> RecordedRig:
         """Return the rig of a rig file, or without one of the cameras found, ordered around the vehicle.
 
-        Raises RecordingError when a topic that the layout needs is not in the recording or is of another type, or fewer
-        than two cameras are found; RigError or TransformError, naming the recording and the camera, for the first that
+        Raises RecordingError when a topic that the layout needs is not in the recording or is of another type, or no
+        camera is found; RigError or TransformError, naming the recording and the camera, for the first that
         is not calibrated or has no transform to the base frame, which `base_frame` names where there is no layout.
         """
         messages = RigMessages(recording, layout)
@@ -132,11 +132,11 @@ def chosen_layout(recording: Recording, layout: RigLayout | None, base_frame: st
 def discover_layout(recording: Recording, base_frame: str) -> RigLayout:
     """Return the recording's cameras as they are found by their topics, without calibrations and poses.
 
-    Raises RecordingError when there are fewer than two.
+    Raises RecordingError when there is none.
     """
     entries = recorded_cameras(recording)
-    if len(entries) < 2:
-        raise RecordingError(f"{recording.path}: {_too_few(entries, recording)}")
+    if not entries:
+        raise RecordingError(f"{recording.path}: {_no_camera(recording)}")
     try:
         return RigLayout(base_frame=base_frame, cameras=tuple(entries))
     except ValidationError as error:
@@ -173,12 +173,12 @@ def _topic_problem(recording: Recording, name: str, types: Sequence[str]) -> str
     return None if topic.count else f"no message on {name}"
 
 
-def _too_few(entries: Sequence[CameraEntry], recording: Recording) -> str:
+def _no_camera(recording: Recording) -> str:
     infos = [topic.name for topic in recording.topics.values() if topic.type == CAMERA_INFO_TYPE]
     images = [topic.name for topic in recording.topics.values() if topic.type in RECORDED_IMAGE_TYPES]
     offers = find_recorded_cameras(recording).offers
     return (
-        f"a surround rig needs two cameras, found {len(entries)}: a camera is a namespace with a camera_info and an "
-        f"image topic; camera_info: {', '.join(infos) or 'none'}; images: {', '.join(images) or 'none'}"
+        f"a rig needs a camera, found 0: a camera is a namespace with a camera_info and an image topic; "
+        f"camera_info: {', '.join(infos) or 'none'}; images: {', '.join(images) or 'none'}"
         f"{offers and f'; {offers}'}"
     )

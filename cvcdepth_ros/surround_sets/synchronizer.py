@@ -425,8 +425,8 @@ def _nearer_to_next(stamp: int, anchor: int, next_anchor: int) -> bool:
 
 
 def _check_cameras(cameras: Sequence[str], anchor: str, offsets: Mapping[str, float]) -> None:
-    if isinstance(cameras, str) or len(cameras) < 2 or len(set(cameras)) != len(cameras):
-        raise ConfigError(f"cameras: expected at least two different names, found {cameras!r}")
+    if isinstance(cameras, str) or not cameras or len(set(cameras)) != len(cameras):
+        raise ConfigError(f"cameras: expected at least one name, all of them different, found {cameras!r}")
     if anchor not in cameras:
         raise ConfigError(f"anchor: {anchor!r} is not one of {', '.join(cameras)}")
     unknown = sorted(set(offsets) - set(cameras))

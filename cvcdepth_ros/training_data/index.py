@@ -76,25 +76,37 @@ class RecordingIndex:
 
 
 def load_index(
-    path: Location, directory: Path, matching: MatchingSettings, rig_layout: RigLayout | None = None
+    path: Location,
+    directory: Path,
+    matching: MatchingSettings,
+    rig_layout: RigLayout | None = None,
+    base_frame: str = "base_link",
 ) -> RecordingIndex:
     """Return the index of the recording at `path`, from `directory` when a current one is there, else built and kept.
 
-    `rig_layout` names cameras and what the recording lacks; without it the cameras are found. Raises
-    RecordingError, RigError or TransformError, naming the recording, when it has no sets or no complete rig.
+    `rig_layout` names cameras and what the recording lacks; without it the cameras are found, and `base_frame` is the
+    vehicle's. Raises RecordingError, RigError or TransformError, naming the recording, when it has no sets or no
+    complete rig.
     """
     kept = KeptResults(directory, _to_arrays, partial(_from_arrays, path))
     return kept.load_or_make(
-        str(path), _work(path, matching, rig_layout), lambda: build_index(path, matching, rig_layout)
+        str(path),
+        _work(path, matching, rig_layout, base_frame),
+        lambda: build_index(path, matching, rig_layout, base_frame),
     )
 
 
-def build_index(path: Location, matching: MatchingSettings, rig_layout: RigLayout | None = None) -> RecordingIndex:
+def build_index(
+    path: Location,
+    matching: MatchingSettings,
+    rig_layout: RigLayout | None = None,
+    base_frame: str = "base_link",
+) -> RecordingIndex:
     """Return the index of the recording at `path`, read anew; see `load_index`."""
     with open_recording(path) as recording:
         if rig_layout is None:
             _refuse_blind_cameras(recording)
-            return index_recording(RecordedRig.from_recording(recording), matching)
+            return index_recording(RecordedRig.from_recording(recording, base_frame=base_frame), matching)
         return index_recording(RecordedRig.from_recording(recording, rig_layout).completed(), matching)
 
 
@@ -198,13 +210,13 @@ def _table(sets: list[SurroundSet[int]], kept: list[int], row: Any) -> NDArray[n
     return np.array([row(sets[i]) for i in kept], dtype=np.int64).reshape(len(kept), -1)
 
 
-def _work(path: Location, matching: MatchingSettings, layout: RigLayout | None) -> Work:
+def _work(path: Location, matching: MatchingSettings, layout: RigLayout | None, base_frame: str) -> Work:
     """Return everything that an index depends on."""
     return {
         "format": _FORMAT,
         "files": file_identities(path),
         "matching": matching.model_dump(),
-        "rig": None if layout is None else layout.model_dump(mode="json"),
+        "rig": {"base_frame": base_frame} if layout is None else layout.model_dump(mode="json"),
     }
 
 

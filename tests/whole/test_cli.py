@@ -61,6 +61,18 @@ def test_the_programs_help_lists_every_command(capsys: pytest.CaptureFixture[str
         assert f"cvcdepth {command} --help" in text
 
 
+def test_the_program_alone_shows_its_help(capsys: pytest.CaptureFixture[str]):
+    assert main([]) == 0
+    assert capsys.readouterr().out == help_of(capsys)
+
+
+def test_every_command_that_makes_a_rig_takes_a_rig_file_and_the_vehicles_frame(capsys: pytest.CaptureFixture[str]):
+    for command in ("check", "rig", "run", "evaluate", "finetune", "bench"):
+        text = help_of(capsys, command)
+        assert "--rig FILE" in text
+        assert "--base-frame FRAME" in text
+
+
 def test_help_and_version_load_neither_torch_nor_ros():
     script = "import sys, cvcdepth_ros.bag_replay; print({'torch', 'cv2', 'rclpy'} & sys.modules.keys())"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
@@ -103,8 +115,8 @@ def test_what_the_program_says_calls_it_by_one_name():
 @pytest.mark.parametrize(
     "arguments",
     [
-        "",
         "fly drive.mcap",
+        "--json",
         "rig",
         "run drive.mcap -o depth --width 640",
         "run drive.mcap -o depth --untrained --checkpoint w.safetensors",

@@ -425,6 +425,19 @@ def test_a_missing_camera_is_refused(config, tmp_path, capsys):
     assert "bag: check 1, cameras: 5 found" in refusal(entries, config, tmp_path, capsys)
 
 
+def test_the_vehicles_frame_is_the_one_that_is_named(config, tmp_path, capsys):
+    assert finetune(config(), tmp_path / "run", "--base-frame", "chassis", *CHEAP) == 1
+    assert "check 3, transforms: no frame is called chassis" in capsys.readouterr().err
+
+
+def test_a_single_camera_is_refused_for_it_has_no_overlap_to_learn_scale_from(config, tmp_path, capsys):
+    others = [f"/camera/{name}/" for name in recordings.CAMERAS if name != "front"]
+    alone = recordings.without(recordings.sample_entries(), *others)
+    bag = recordings.write_rosbag2(tmp_path / "alone", alone)
+    assert finetune(config(), tmp_path / "run", *CHEAP, bags=(bag,)) == 1
+    assert "camera front: shares no view with another camera" in capsys.readouterr().err
+
+
 def test_cameras_without_a_common_view_are_refused(config, tmp_path, capsys):
     others = [f"/camera/{name}/" for name in recordings.CAMERAS if name not in ("front", "back")]
     error = refusal(recordings.without(recordings.sample_entries(3), *others), config, tmp_path, capsys)

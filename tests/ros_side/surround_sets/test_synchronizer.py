@@ -481,9 +481,9 @@ def test_two_threads_lose_nothing():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"cameras": ["a"]}, r"cameras: expected at least two different names, found \['a'\]"),
-        ({"cameras": ["a", "a"]}, r"cameras: expected at least two different names"),
-        ({"cameras": "ab"}, r"cameras: expected at least two different names, found 'ab'"),
+        ({"cameras": []}, r"cameras: expected at least one name, all of them different, found \[\]"),
+        ({"cameras": ["a", "a"]}, r"cameras: expected at least one name, all of them different"),
+        ({"cameras": "ab"}, r"cameras: expected at least one name, all of them different, found 'ab'"),
         ({"anchor": "c"}, "anchor: 'c' is not one of a, b"),
         ({"tolerance": -0.1}, r"tolerance: expected a number of seconds of at least 0.0, found -0.1"),
         ({"tolerance": float("nan")}, "tolerance: .* found nan"),

@@ -209,6 +209,17 @@ def test_a_rig_that_was_found_follows_later_calibrations(graph, messages):
     feed.publish_until(lambda: "K[0] = 0" in message_of(graph, "camera left"), "the refusal")
 
 
+def test_one_camera_is_a_rig_too_after_it_has_been_alone_for_a_while(graph, messages):
+    tf2_msgs = pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not built here (make tf2_msgs)")
+    feed = Feed(graph, {topic: found for topic, found in messages.items() if topic.startswith("/camera/left/")})
+    transforms = graph.node.create_publisher(tf2_msgs.TFMessage, "/tf_static", reliable(latched=True))
+    transforms.publish(transform_message(tf2_msgs, messages))
+    graph.subscribe(PointCloud2, "/surround_depth/points")
+    graph.start_node(rig="auto", **SMALL)
+    feed.publish_until(lambda: graph.received["/surround_depth/points"], "a cloud")
+    graph.await_status("cross-view consistency", "ok")
+
+
 def test_a_rig_is_not_settled_on_with_fewer_cameras_than_are_asked_for(graph, messages):
     pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not built here (make tf2_msgs)")
     two = {topic: found for topic, found in messages.items() if topic.startswith(("/camera/front/", "/camera/left/"))}
@@ -431,17 +442,17 @@ def test_qos_overrides_make_a_single_topic_match(graph, messages, rig_content, t
         ({"rig": "RIG", "checkpoint": "DAMAGED"}, "is damaged or not a safetensors file"),
         ({"rig": "RIG", "untrained": True, "encoder": "vgg"}, "parameter encoder: expected one of resnet18, resnet34"),
         ({"rig": "RIG", "untrained": True, "device": "abacus"}, "device: 'abacus' is not available"),
-        ({"rig": "ONE_CAMERA", "untrained": True}, "a surround rig needs at least two cameras, found 1: front"),
+        ({"rig": "NO_CAMERA", "untrained": True}, "a rig needs at least one camera, found none"),
     ],
 )
 def test_what_cannot_start_is_one_line_and_a_diagnostic(parameters, reason, graph, rig_content, tmp_path):
     damaged = tmp_path / "damaged.safetensors"
     damaged.write_bytes(b"\xff" * 64)
-    one = tmp_path / "one"
-    one.mkdir()
+    none = tmp_path / "none"
+    none.mkdir()
     files = {
         "RIG": write_rig(tmp_path, rig_content),
-        "ONE_CAMERA": write_rig(one, rig_content | {"cameras": rig_content["cameras"][:1]}),
+        "NO_CAMERA": write_rig(none, rig_content | {"cameras": []}),
         "DAMAGED": damaged,
     }
     graph.start_node(**{name: files.get(str(value), value) for name, value in parameters.items()})
