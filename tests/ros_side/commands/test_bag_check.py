@@ -136,14 +136,17 @@ def test_without_cameras_the_other_checks_say_so(check, sample):
     )
 
 
-def test_one_camera_info_that_cannot_be_read_costs_itself_and_if_none_can_the_check_fails(check, sample):
-    infos = [i for i, entry in enumerate(sample) if entry.topic == "/camera/left/camera_info"]
+def cut_camera_infos(sample: list[Entry], damaged: slice) -> list[Entry]:
+    numbers = [i for i, entry in enumerate(sample) if entry.topic == "/camera/left/camera_info"][damaged]
+    return [e._replace(cdr=e.cdr[:40]) if i in numbers else e for i, e in enumerate(sample)]
 
-    def cut(damaged: list[int]) -> list[Any]:
-        return [e._replace(cdr=e.cdr[:40]) if i in damaged else e for i, e in enumerate(sample)]
 
-    assert check(cut(infos[:1]))["cameras"]["status"] == "passed"
-    found = check(cut(infos))["cameras"]
+def test_one_camera_info_that_cannot_be_read_costs_itself(check, sample):
+    assert check(cut_camera_infos(sample, slice(1)))["cameras"]["status"] == "passed"
+
+
+def test_camera_infos_none_of_which_can_be_read_fail(check, sample):
+    found = check(cut_camera_infos(sample, slice(None)))["cameras"]
     assert found["status"] == "failed"
     assert "/camera/left/camera_info at" in found["finding"]
 
