@@ -24,7 +24,7 @@ from cvcdepth_ros.live.problem_log import ProblemLog
 from cvcdepth_ros.live.process_setup import prepare_process, return_memory
 from cvcdepth_ros.live.set_progress import NodeClock
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
-from cvcdepth_ros.node.diagnostics import ERROR, OK, WARN, status
+from cvcdepth_ros.node.diagnostics import ERROR, OK, UNKNOWN_LATENCY, WARN, status
 from cvcdepth_ros.node.live_rig import LiveRigDiscovery
 from cvcdepth_ros.node.managed_node import ManagedNode
 from cvcdepth_ros.node.parameters import (
@@ -114,6 +114,8 @@ class SurroundDepthNode(ManagedNode):
             self.get_logger().info(
                 f"{stage}: p50 {summary.p50_ms:.1f} ms, p95 {summary.p95_ms:.1f} ms, max {summary.max_ms:.1f} ms"
             )
+        for stage in session.unknown_latencies:
+            self.get_logger().info(f"{stage}: {UNKNOWN_LATENCY}")
         return session.close()
 
     def _configure(self) -> None:

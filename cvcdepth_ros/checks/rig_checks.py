@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 
 from cvcdepth_ros.bags import Recording
 from cvcdepth_ros.checks.context import CheckContext, CheckResult
+from cvcdepth_ros.messages.camera_discovery import is_output
 from cvcdepth_ros.messages.transforms import frame_name
 from cvcdepth_ros.recordings.fixed_frames import MOVING_TRANSFORMS
 from cvcdepth_ros.recordings.rig import (
@@ -127,6 +128,7 @@ def _unknown(recording: Recording) -> Iterator[str]:
     """Yield the image topics without a camera_info in their namespace."""
     known = tuple(camera.camera_info_topic.removesuffix(_INFO) for camera in recorded_cameras(recording))
     for topic in recording.topics.values():
-        is_picture = topic.type in IMAGE_TYPES and not is_of_depth(topic.name)
+        is_made = is_of_depth(topic.name) or is_output(topic.name, recording.topics)
+        is_picture = topic.type in IMAGE_TYPES and not is_made
         if is_picture and topic.count and not topic.name.startswith(known):
             yield topic.name

@@ -5,7 +5,7 @@ A camera is a namespace with a `camera_info` and at least one image topic (image
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 
 from cvcdepth_core.rig.rig_file import CameraEntry
 
@@ -26,7 +26,8 @@ def discover_cameras(topic_types: Mapping[str, str]) -> list[CameraEntry]:
     """
     infos = sorted(topic for topic, type_name in topic_types.items() if type_name == CAMERA_INFO_TYPE)
     namespaces = [topic.removesuffix(_INFO_SUFFIX) for topic in infos if topic.endswith(_INFO_SUFFIX)]
-    found = {namespace: _image_topics(namespace, topic_types) for namespace in namespaces}
+    given = (namespace for namespace in namespaces if not is_output(namespace + _INFO_SUFFIX, topic_types))
+    found = {namespace: _image_topics(namespace, topic_types) for namespace in given}
     with_images = {namespace: topics for namespace, topics in found.items() if topics}
     names = _shortest_unique_names(list(with_images))
     return [
@@ -38,6 +39,16 @@ def discover_cameras(topic_types: Mapping[str, str]) -> list[CameraEntry]:
         )
         for namespace, topics in with_images.items()
     ]
+
+
+def is_output(topic: str, topics: Container[str]) -> bool:
+    """Whether a topic is the rectified picture, or its camera_info, that a node or `run` of ours has put out.
+
+    They stand beside the depth of the same picture, where a camera's raw pictures do not.
+    """
+    namespace = topic.rpartition("/")[0]
+    beside = ("image_rect", "depth/image_rect", "depth/camera_info")
+    return all(f"{namespace}/{part}" in topics for part in beside) and f"{namespace}/image_raw" not in topics
 
 
 def _image_topics(namespace: str, topic_types: Mapping[str, str]) -> list[str]:

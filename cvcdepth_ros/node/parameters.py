@@ -41,6 +41,8 @@ class NodeParameters(OutputSettings, MissingCameraSettings, MatchingSettings, Mo
     """Seconds of the very same picture after which a camera counts as frozen and is left out; 0 accepts any."""
     overlap_monitor: bool = True
     """Compare neighbouring cameras in their overlaps, to tell of a shifted mount or a dirty lens in /diagnostics."""
+    publish_tf: bool = True
+    """Publish the camera poses of a rig file on /tf_static, but for frames that TF has already."""
     trace: str = ""
     """File for a trace of every stage that https://ui.perfetto.dev opens; at most 64 MB."""
 

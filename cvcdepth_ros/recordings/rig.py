@@ -12,7 +12,13 @@ from pydantic import ValidationError
 from cvcdepth_core.errors import RecordingError, RigError, first_validation_message
 from cvcdepth_core.rig.rig_file import CameraEntry, RigLayout
 from cvcdepth_ros.bags import Recording
-from cvcdepth_ros.messages.camera_discovery import CAMERA_INFO_TYPE, COMPRESSED_IMAGE_TYPE, IMAGE_TYPE, discover_cameras
+from cvcdepth_ros.messages.camera_discovery import (
+    CAMERA_INFO_TYPE,
+    COMPRESSED_IMAGE_TYPE,
+    IMAGE_TYPE,
+    discover_cameras,
+    is_output,
+)
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
 from cvcdepth_ros.messages.transforms import TransformTree
 from cvcdepth_ros.recordings.motion import MotionLink, VehicleMotion, find_motion_link
@@ -124,7 +130,8 @@ def topics_without_images(recording: Recording) -> Iterator[str]:
     """Yield the camera_info topics without images in their namespace: a rig that is found would silently lack them."""
     seeing = {camera.camera_info_topic for camera in recorded_cameras(recording)}
     for topic in recording.topics.values():
-        if topic.type == CAMERA_INFO_TYPE and topic.name not in seeing and not is_of_depth(topic.name):
+        is_of_pictures = not is_of_depth(topic.name) and not is_output(topic.name, recording.topics)
+        if topic.type == CAMERA_INFO_TYPE and topic.name not in seeing and is_of_pictures:
             yield topic.name
 
 
