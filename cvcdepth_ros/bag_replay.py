@@ -10,6 +10,7 @@ from typing import Any, Protocol
 
 from cvcdepth_core.errors import CvcDepthError, NotPromotedError
 from cvcdepth_ros.commands import bench, check, evaluate, export, finetune, import_weights, inspect, play, rig, run
+from cvcdepth_ros.console import styled
 from cvcdepth_ros.installation import package_version
 
 PROGRAM = "cvcdepth"
@@ -98,7 +99,7 @@ def _texts(program: str, description: str, examples: Sequence[str]) -> dict[str,
 
 
 def _fail(program: str, reason: str, code: int = 1) -> int:
-    print(f"{program}: {' '.join(reason.split())}", file=sys.stderr)
+    print(f"{styled(f'{program}:', 'red', sys.stderr)} {' '.join(reason.split())}", file=sys.stderr)
     return code
 
 

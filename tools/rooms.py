@@ -71,7 +71,7 @@ ROS_ROOMS = {
     "commands": "installation settings console bags kept messages surround_sets recordings live checks training_data "
     "evaluation node finetuning end_to_end bench reports",
     "demo": "installation settings console bags messages surround_sets recordings end_to_end reports",
-    "bag_replay": "installation commands",
+    "bag_replay": "installation console commands",
     "surround_depth_node": "messages live node",
 }
 

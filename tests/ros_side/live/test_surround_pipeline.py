@@ -150,7 +150,7 @@ def test_a_network_that_looks_at_all_cameras_gives_one_subscriber_what_it_gives_
         running.wanted = wanted
         running.feed(images[:12])
         running.wait(lambda running=running: running.published)
-        depth.append(running.published[0].result.depth)
+        depth.append(running.published[0].result)
     assert all(one.present.all() for one in depth)
     np.testing.assert_array_equal(depth[0].depth, depth[1].depth)
     nobody = start(predictor)
