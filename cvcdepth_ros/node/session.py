@@ -29,10 +29,11 @@ from cvcdepth_ros.node.diagnostics import (
     overlap_status,
     synchronisation_status,
 )
-from cvcdepth_ros.node.parameters import NodeParameters, read_parameters, unknown_qos_overrides
+from cvcdepth_ros.node.parameters import read_parameters, unknown_qos_overrides
 from cvcdepth_ros.node.publishers import SurroundOutputs
 from cvcdepth_ros.node.rig_transforms import RigTransforms
 from cvcdepth_ros.node.subscriptions import CameraInputs, StaticTransformInput
+from cvcdepth_ros.settings import NodeParameters
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
 from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet
 from cvcdepth_ros.surround_sets.synchronizer import SurroundSynchronizer
