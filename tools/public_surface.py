@@ -134,7 +134,7 @@ def exit_codes() -> Iterator[str]:
             yield f"{bag_replay.main(['command'])} {reason}"
     try:
         with _silence():
-            bag_replay.main([])
+            bag_replay.main(["no such command"])
     except SystemExit as ended:
         yield f"{ended.code} wrong use"
 
