@@ -20,6 +20,7 @@ from cvcdepth_ros.live.picture_preparation import CameraImage
 from cvcdepth_ros.live.pipeline import SurroundPipeline
 from cvcdepth_ros.live.set_progress import NodeClock, SetProgress
 from cvcdepth_ros.live.stamp_ages import StampAges
+from cvcdepth_ros.live.transport_loss import TransportLoss
 from cvcdepth_ros.messages.conversion import stamp_ns
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
 from cvcdepth_ros.node.diagnostics import (
@@ -66,6 +67,9 @@ class SurroundSession:
         self._monitored_rig: Rig | None = None
         self._max_image_mb = parameters.max_image_mb
         self._offsets_ns = {camera.name: camera.stamp_offset_ns for camera in layout.cameras}
+        self._loss = TransportLoss()
+        self.transport_problem = ""
+        """Why images do not arrive that were sent; empty while they do."""
         self._progress = SetProgress(self._synchroniser.required, parameters.tolerance, parameters.max_age)
         self._is_finished = False
         with ExitStack() as opened:
@@ -115,6 +119,7 @@ class SurroundSession:
             self._transforms.poll()
         counts = {**asdict(self._mailbox.statistics()), **self._pipeline.counters}
         self._progress.update(self._synchroniser.statistics(), counts)
+        self.transport_problem = self._loss.update(self._inputs.lost)
 
     def set_model(self, estimator: DepthEstimator) -> None:
         """Use another network from the next set on; EngineError when it cannot run."""

@@ -50,6 +50,7 @@ class SurroundDepthNode(ManagedNode):
         self._session: SurroundSession | None = None
         self._problem_log = ProblemLog(self.get_logger())
         self._refused = 0
+        self._is_idleness_told = False
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         # Steady time: with use_sim_time and no /clock yet, these must run all the same.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -92,6 +93,7 @@ class SurroundDepthNode(ManagedNode):
             self._discovery.close()
             self._discovery = None
         session, self._session = self._session, None
+        self._is_idleness_told = False
         self._problem_log.forget_cameras()
         if session is None:
             return True
@@ -161,6 +163,7 @@ class SurroundDepthNode(ManagedNode):
         if session is not None:
             session.poll()
             self._report_refusals(session.refused, session.problem)
+            self._report_idleness(session)
         conditions = session.conditions() if session else {}
         self._problem_log.tell(self._problems(), conditions, is_matching=session is None or session.is_matching)
 
@@ -171,12 +174,21 @@ class SurroundDepthNode(ManagedNode):
             "rig auto": self._discovery.problem() if self._discovery else "",
             "clock": clock.problem if session else "",
             "sets": session.standstill(clock) if session else "",
+            "transport": session.transport_problem if session else "",
             "cross-view consistency": session.overlap_findings() if session else "",
         }
 
     def _node_clock(self) -> NodeClock:
         is_simulated = bool(self.get_parameter("use_sim_time").value)
         return NodeClock(is_simulated, has_publisher=self.count_publishers(_CLOCK_TOPIC) > 0)
+
+    def _report_idleness(self, session: SurroundSession) -> None:
+        """Log once that depth could be computed, and nobody wants it: no subscriber looks like no depth."""
+        if session.has_idle_sets and not self._is_idleness_told:
+            self._is_idleness_told = True
+            self.get_logger().info(
+                "sets are matched, but nothing subscribes to the node's topics: no depth is computed"
+            )
 
     def _report_refusals(self, count: int, reason: str) -> None:
         if count > self._refused and reason:

@@ -106,6 +106,17 @@ def test_a_camera_that_never_sends_is_told_as_the_one_that_is_waited_for(graph: 
     assert "min_cameras:=5 goes on without" in lines_with(graph, "WARN", told)[0]
 
 
+def test_that_nobody_subscribes_is_told_once(graph: RosGraph, rig: Path):
+    cameras = Cameras(graph)
+    graph.start_node(rig=rig, max_age=0.0, **SMALL)
+    told = "sets are matched, but nothing subscribes to the node's topics: no depth is computed"
+    cameras.run_until(lambda: lines_with(graph, "INFO", told), "the line")
+    for _ in range(20):
+        cameras.cycle()
+        graph.spin(0.1)
+    assert len(lines_with(graph, "INFO", told)) == 1
+
+
 def test_rig_auto_says_what_it_waits_for_and_since_when(graph: RosGraph):
     pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not built here (make tf2_msgs)")
     graph.start_node(rig="auto", **SMALL)
