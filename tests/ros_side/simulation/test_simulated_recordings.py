@@ -157,9 +157,9 @@ def test_lidar_points_lie_in_the_depth_images_of_the_recording_to_1e_4(recorded:
     compared = 0
     for camera in SPEC.layout.complete().cameras:
         for image in messages(recorded, truth_topic(camera.name, "depth")):
-            swept = sweeps.at(stamp_ns(image))
+            swept = sweeps.points_at(stamp_ns(image))
             assert swept is not None
-            points = swept.points @ inverse(camera.base_T_camera)[:3, :3].T + inverse(camera.base_T_camera)[:3, 3]
+            points = swept @ inverse(camera.base_T_camera)[:3, :3].T + inverse(camera.base_T_camera)[:3, 3]
             points = points[points[:, 2] > 1.0]
             errors = depth_errors(image.data.view("<f4").reshape(40, 64).astype(float), points, K)
             compared += len(errors)
