@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cvcdepth_core.worlds.meshes import Floats
+from cvcdepth_core.worlds.shapes.meshes import Floats
 
 _STEP = 0.25  # metres; between them the curve is an arc to 1e-6 m
 _SEARCH_STEP = 4  # samples: the spacing at which the nearest place is first looked for

@@ -83,7 +83,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(arguments: argparse.Namespace) -> None:
     """Simulate, or go on with what was interrupted."""
-    from cvcdepth_core.worlds.ray_engine import require_engine
+    from cvcdepth_core.worlds.rendering.ray_engine import require_engine
     from cvcdepth_ros.simulation.recording import record
     from cvcdepth_ros.simulation.set_messages import Form
 

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 from cvcdepth_core.errors import ConfigError, OutputError, RigError
 from cvcdepth_core.files import write_atomically
-from cvcdepth_core.worlds.dice import Dice
 from cvcdepth_core.worlds.drive import DriveSpec
+from cvcdepth_core.worlds.generation.dice import Dice
 from cvcdepth_core.worlds.sensors import Sensors
 from cvcdepth_core.worlds.shards import SUFFIX, PictureForm, write_shard
 from cvcdepth_ros.simulation.choices import LookChoice, OdometryChoice, chosen_layout, chosen_sensors, chosen_world

@@ -10,8 +10,8 @@ import numpy as np
 
 from cvcdepth_core.rig.rig import CameraEntry, RigLayout
 from cvcdepth_core.worlds.drive import DriveSpec, SimulatedDrive
-from cvcdepth_core.worlds.lidar import lidar_mount
 from cvcdepth_core.worlds.odometry import Told
+from cvcdepth_core.worlds.rendering.lidar import lidar_mount
 from cvcdepth_ros.simulation.messages import (
     NANOSECONDS,
     camera_info,

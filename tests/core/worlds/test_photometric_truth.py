@@ -8,9 +8,9 @@ import pytest
 from cvcdepth_core.rig.calibration import Calibration
 from cvcdepth_core.rig.poses import inverse
 from cvcdepth_core.worlds.building import build_world
-from cvcdepth_core.worlds.lenses import Lens
-from cvcdepth_core.worlds.random_world import random_world
-from cvcdepth_core.worlds.renderer import Renderer, View
+from cvcdepth_core.worlds.generation.random_world import random_world
+from cvcdepth_core.worlds.rendering.lenses import Lens
+from cvcdepth_core.worlds.rendering.renderer import Renderer, View
 
 pytest.importorskip("embreex", reason="worlds need embreex")
 

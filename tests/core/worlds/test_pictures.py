@@ -7,18 +7,18 @@ from simple_worlds import FORWARD, LENSES, Standing, daylight, short_drive, simp
 
 from cvcdepth_core.errors import ConfigError
 from cvcdepth_core.worlds.building import build_world
-from cvcdepth_core.worlds.camera_response import daylight_of, develop
 from cvcdepth_core.worlds.description import Building, Drive, Sky, WorldSpec
-from cvcdepth_core.worlds.dice import Dice
 from cvcdepth_core.worlds.drive import DriveSpec, SimulatedDrive
-from cvcdepth_core.worlds.lenses import Lens
-from cvcdepth_core.worlds.materials import FacadeParameters, Layer, Material, MaterialTable, Pattern, evaluate
-from cvcdepth_core.worlds.meshes import box, cylinder, extruded, face_normals, prism, sphere
-from cvcdepth_core.worlds.noise import Noise, noise
-from cvcdepth_core.worlds.random_world import random_world
-from cvcdepth_core.worlds.renderer import Renderer
+from cvcdepth_core.worlds.generation.dice import Dice
+from cvcdepth_core.worlds.generation.random_world import random_world
+from cvcdepth_core.worlds.rendering.camera_response import daylight_of, develop
+from cvcdepth_core.worlds.rendering.lenses import Lens
+from cvcdepth_core.worlds.rendering.renderer import Renderer
 from cvcdepth_core.worlds.sensors import CameraLook, Sensors, random_look
+from cvcdepth_core.worlds.shapes.meshes import box, cylinder, extruded, face_normals, prism, sphere
 from cvcdepth_core.worlds.site import Site
+from cvcdepth_core.worlds.surfaces.materials import FacadeParameters, Layer, Material, MaterialTable, Pattern, evaluate
+from cvcdepth_core.worlds.surfaces.noise import Noise, noise
 
 pytest.importorskip("embreex", reason="worlds need embreex")
 
