@@ -39,7 +39,7 @@ def flow(
 
 def _followed(points: Floats, objects: Floats, world: World, way: Way, time: float, later: float) -> Floats:
     """Move the points of each mover, and of the vehicle itself, from where it is at a time to where it is later."""
-    followed = points.copy()
+    followed: Floats = points.copy()
     for number, own in [(OWN_VEHICLE, way), *((mover.number, mover.way) for mover in world.movers)]:
         on_it = objects == number
         if on_it.any():
