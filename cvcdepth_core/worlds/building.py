@@ -96,6 +96,7 @@ def build_light(sky: Sky, lamps: Lamps) -> Light:
         cloud_offset=(u, v),
         visibility=sky.visibility,
         lamps=lamps,
+        dark=sky.weather in ("dusk", "night"),
     )
 
 
@@ -106,7 +107,7 @@ def _moving_vehicles(site: Site) -> list[Mover]:
             mesh = vehicle_mesh(site, vehicle)
             length = float(np.ptp(mesh.vertices[:, 0]))
             way = vehicle_trajectory(site, vehicle, vehicle.motion, length)
-            found.append(Mover(site.new_object(vehicle.kind), mesh, way))
+            found.append(Mover(site.new_object(vehicle.kind), mesh, way, headlights=True))
     return found
 
 

@@ -36,6 +36,8 @@ class Mover:
     mesh: Mesh
     """In its own frame: x forward, z up, on the ground."""
     way: Way
+    headlights: bool = False
+    """Whether it has some, for when it is dark."""
 
 
 @dataclass(frozen=True, eq=False)

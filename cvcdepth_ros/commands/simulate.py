@@ -105,6 +105,8 @@ def _simulate_many(arguments: argparse.Namespace, workers: int) -> None:
     for option in ("sensors", "no_lidar"):
         if getattr(arguments, option):
             arguments.usage_error(f"argument --{option.replace('_', '-')}: not with --many")
+    if arguments.odometry != "exact":
+        arguments.usage_error("argument --odometry: shards hold the true motion")
     if arguments.images == "raw":
         arguments.usage_error("argument --images: shards hold jpeg or png")
     choices = ManyDrives(
@@ -117,7 +119,6 @@ def _simulate_many(arguments: argparse.Namespace, workers: int) -> None:
         arguments.rate or 10.0,
         arguments.samples,
         arguments.look,
-        arguments.odometry,
         arguments.body or "varied",
         arguments.stagger,
         arguments.readout or 0.0,

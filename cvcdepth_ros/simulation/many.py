@@ -14,7 +14,7 @@ from cvcdepth_core.worlds.drive import DriveSpec
 from cvcdepth_core.worlds.generation.dice import Dice
 from cvcdepth_core.worlds.sensors import Sensors
 from cvcdepth_core.worlds.shards import SUFFIX, PictureForm, write_shard
-from cvcdepth_ros.simulation.choices import LookChoice, OdometryChoice, chosen_layout, chosen_sensors, chosen_world
+from cvcdepth_ros.simulation.choices import LookChoice, chosen_layout, chosen_sensors, chosen_world
 from cvcdepth_ros.simulation.workers import run_all
 from cvcdepth_ros.version import package_version
 
@@ -35,7 +35,6 @@ class ManyDrives(NamedTuple):
     rate: float
     samples: int
     look: LookChoice
-    odometry: OdometryChoice
     body: str
     """none, car, van, robot; or varied: none for half of the drives."""
     stagger: float | None
@@ -107,7 +106,7 @@ def drive_spec(choices: ManyDrives, number: int, attempt: int = 0) -> DriveSpec:
     dice = Dice(choices.seed, number, attempt, 401)
     seed = dice.whole(0, 2**31 - 1)
     layout = chosen_layout(choices.rig, choices.size, seed)
-    sensors = chosen_sensors(len(layout.cameras), choices.look, choices.odometry, seed)
+    sensors = chosen_sensors(len(layout.cameras), choices.look, "exact", seed)
     body = choices.body
     if body == "varied":
         body = dice.weighted({"none": 0.5, "car": 0.35, "van": 0.08, "robot": 0.07})

@@ -71,6 +71,8 @@ class Light:
     visibility: float
     """Metres after which 1 / e of a thing's light is left."""
     lamps: Lamps
+    dark: bool = False
+    """Whether vehicles have their lights on."""
 
     def sky(self, directions: Floats) -> Floats:
         """Light [3, N] from unit directions [3, N]."""

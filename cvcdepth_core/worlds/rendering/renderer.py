@@ -18,6 +18,7 @@ from cvcdepth_core.worlds.shapes.meshes import Floats, Mesh
 from cvcdepth_core.worlds.world import SKY, Way, World
 
 _NEAR = 0.02  # metres: nothing is seen closer to the lens
+_SAMPLES_AT_ONCE = 262_144  # rays that are shaded at once, which bounds the memory for large pictures
 _BAND = 16  # rows of a rolling shutter that are drawn at once
 
 
@@ -94,17 +95,30 @@ class Renderer:
         return truth, openness(self.scene, rays, distances, truth)
 
     def _light(self, lens: Lens, base_T_camera: Pose, band: _Band, opened: Floats) -> NDArray[np.float32]:
+        """Return linear light [H, W, 3], shaded some rows at a time."""
         n = self._samples
-        rows = slice(band.rows.start * n, band.rows.stop * n)
-        poses = np.repeat(self._way.poses(band.times) @ base_T_camera, n if len(band.times) > 1 else 1, axis=0)
-        rays = _rays(lens.rays(n)[:, rows], poses.astype(np.float32))
-        spread = _finer(lens.pixel_angles[band.rows] / n, n).astype(np.float32)
-        light = shade(self.scene, rays, spread, _finer(opened, n), lens.width * n)
-        samples = light.reshape(3, len(opened), n, lens.width, n)
-        mean = samples[:, :, 0, :, 0] / np.float32(n * n)
-        for dy, dx in [(i // n, i % n) for i in range(1, n * n)]:
-            mean += samples[:, :, dy, :, dx] / np.float32(n * n)
-        return np.ascontiguousarray(np.moveaxis(mean, 0, -1), np.float32)
+        poses = (self._way.poses(band.times) @ base_T_camera).astype(np.float32)
+        height = len(opened)
+        step = max(1, _SAMPLES_AT_ONCE // (lens.width * n * n))
+        blocks = []
+        for start in range(0, height, step):
+            rows = slice(start, min(start + step, height))
+            own = np.repeat(poses[rows] if len(poses) > 1 else poses, n if len(poses) > 1 else 1, axis=0)
+            first = band.rows.start
+            rays = _rays(lens.rays(n)[:, (first + rows.start) * n : (first + rows.stop) * n], own)
+            spread = _finer(lens.pixel_angles[first + rows.start : first + rows.stop] / n, n).astype(np.float32)
+            light = shade(self.scene, rays, spread, _finer(opened[rows], n), lens.width * n)
+            blocks.append(_averaged(light.reshape(3, rows.stop - rows.start, n, lens.width, n)))
+        return np.concatenate(blocks)
+
+
+def _averaged(samples: Floats) -> Floats:
+    """Return the mean over each pixel's samples [3, H, n, W, n], [H, W, 3] float32."""
+    n = samples.shape[2]
+    mean = samples[:, :, 0, :, 0] / np.float32(n * n)
+    for dy, dx in [(i // n, i % n) for i in range(1, n * n)]:
+        mean += samples[:, :, dy, :, dx] / np.float32(n * n)
+    return np.ascontiguousarray(np.moveaxis(mean, 0, -1), np.float32)
 
 
 class _Band(NamedTuple):

@@ -3,17 +3,21 @@
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import numpy as np
 
 from cvcdepth_core.rig.poses import Pose
+from cvcdepth_core.worlds.rendering.light import Lamps
 from cvcdepth_core.worlds.rendering.ray_engine import Hits, TriangleScene
 from cvcdepth_core.worlds.shapes.meshes import Floats, Ints, Mesh, cross, joined
 from cvcdepth_core.worlds.world import OWN_VEHICLE, World
 
 _MOVER_REACH = 220.0  # metres: movers farther away are left out
 _STANDING = 0.02  # m/s
+_BEAM, _BEAM_SPREAD = np.array([70.0, 66.0, 58.0]), 45.0  # light of a headlight at one metre, and how narrow it is
+_OWN_FRONT = 2.2  # metres from the base to the headlights of the vehicle that carries the sensors
 
 
 class Rays(NamedTuple):
@@ -87,15 +91,21 @@ class Scene:
         self._still = TriangleScene(world.mesh.vertices.astype(np.float32)[world.mesh.faces])
         self._moving = TriangleScene(np.zeros((0, 3, 3), np.float32))
         self._near: Ints = np.zeros(0, np.int32)
+        self.headlights = Lamps.none()
+        """Of the vehicles that move, and of the one that carries the sensors, at the moment."""
         self._moment: tuple[float, bytes] | None = None
 
     def set_moment(self, time: float, world_T_base: Pose, speed: float = 0.0) -> None:
         """Put everything that moves where it is at a time (seconds), the sensors' vehicle at `world_T_base`."""
         moment = (time, world_T_base.tobytes())
-        if moment == self._moment or not len(self._movers.objects):
+        if moment == self._moment:
             return
         self._moment = moment
         movers = self._movers
+        if self.world.light.dark:
+            self.headlights = self._headlights(time, world_T_base)
+        if not len(movers.objects):
+            return
         poses = np.stack([*(way.pose(time) for way in movers.ways), world_T_base])[: len(movers.objects)]
         speeds = np.array([*(way.speed(time) for way in movers.ways), speed])[: len(movers.objects)]
         near = np.linalg.norm(poses[:, :3, 3] - world_T_base[:3, 3], axis=1) < _MOVER_REACH
@@ -108,6 +118,13 @@ class Scene:
         self.faces.write(self._near, corners, normals)
         self.faces.moving[self._near] = np.abs(speeds[of_face]) > _STANDING
         self._moving = TriangleScene(corners)
+
+    def _headlights(self, time: float, world_T_base: Pose) -> Lamps:
+        shining = [mover for mover in self.world.movers if mover.headlights]
+        poses = [mover.way.pose(time) for mover in shining]
+        fronts = [float(mover.mesh.vertices[:, 0].max()) for mover in shining]
+        lamps = [_pair(pose, front) for pose, front in zip(poses, fronts, strict=True)]
+        return functools.reduce(Lamps.joined, lamps, _pair(world_T_base, _OWN_FRONT))
 
     def nearest(self, rays: Rays) -> Hits:
         """Return what the rays meet first; faces are numbered as in `faces`."""
@@ -140,6 +157,13 @@ class Scene:
         open_ones = np.flatnonzero(~blocked)
         blocked[open_ones] = self._moving.blocked(origins[open_ones], directions[open_ones], reach[open_ones])
         return blocked
+
+
+def _pair(pose: Pose, front: float) -> Lamps:
+    """Return the two headlights of a vehicle whose front is so many metres before its origin."""
+    places = np.array([(front, 0.6, 0.65), (front, -0.6, 0.65)]) @ pose[:3, :3].T + pose[:3, 3]
+    axis = np.tile(pose[:3, 0] - 0.03 * pose[:3, 2], (2, 1))
+    return Lamps(places, np.tile(_BEAM, (2, 1)), axis, np.full(2, _BEAM_SPREAD))
 
 
 def _single(values: Floats) -> Floats:

@@ -52,7 +52,7 @@ def shade(scene: Scene, rays: Rays, spread: Floats, opened: Floats, row: int) ->
     result[:, missed] = light.sky(directions[:, missed])
     if len(hit):
         places = _places(scene, rays, hits, hit, directions[:, hit], spread[hit])
-        lamps = light.lamps.nearest(rays.origins[0], _MOST_LAMPS, _LAMP_REACH)
+        lamps = light.lamps.joined(scene.headlights).nearest(rays.origins[0], _MOST_LAMPS, _LAMP_REACH)
         lit = _lit(scene, places, opened[hit], _sun_offsets(row, len(directions[0]))[:, hit], lamps)
         lit = _with_reflections(scene, places, lit, spread[hit])
         result[:, hit] = light.through_air(lit, places.directions, places.distances)
