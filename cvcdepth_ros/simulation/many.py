@@ -19,6 +19,7 @@ from cvcdepth_ros.simulation.workers import run_all
 from cvcdepth_ros.version import package_version
 
 _RECIPE = "recipe.json"
+_CAR_HEIGHT = 1.1  # metres: lower cameras are those of robots
 _ATTEMPTS = 8  # seeds that are tried for a drive: now and then a vehicle would start inside of something
 
 
@@ -109,7 +110,8 @@ def drive_spec(choices: ManyDrives, number: int, attempt: int = 0) -> DriveSpec:
     sensors = chosen_sensors(len(layout.cameras), choices.look, "exact", seed)
     body = choices.body
     if body == "varied":
-        body = dice.weighted({"none": 0.5, "car": 0.35, "van": 0.08, "robot": 0.07})
+        high = min(camera.base_T_camera[2, 3] for camera in layout.complete().cameras) > _CAR_HEIGHT
+        body = dice.weighted({"none": 0.5, "car": 0.4, "van": 0.1} if high else {"none": 0.6, "robot": 0.4})
     stagger = dice.between(0.0, 0.9) if choices.stagger is None else choices.stagger
     changes = {"rate": choices.rate, "stagger": stagger, "readout": choices.readout, "body": body, "lidar": None}
     return DriveSpec(

@@ -20,6 +20,7 @@ _SUN_RADIUS = 0.012  # radians: a little more than the sun's, for edges as soft 
 _LEAST_REFLECTION = 0.02
 _LAMP_REACH, _MOST_LAMPS = 70.0, 24
 _BRIGHTEST = 60.0
+_BEAM, _BEAM_NEAR = 10.0, 60.0  # exponent from which a lamp is a headlight; square metres within which it is even
 
 
 class _Places(NamedTuple):
@@ -126,7 +127,8 @@ def _lamplight(lamps: Lamps, places: _Places) -> Floats:
         lamps.positions, lamps.colours, lamps.directions, lamps.spread, strict=True
     ):
         way = position.astype(np.float32)[:, None] - places.points
-        squared = np.maximum(_dot(way, way), 0.05)
+        # Headlights are shaped so that the road right before them is not lit most.
+        squared = np.maximum(_dot(way, way), _BEAM_NEAR if spread > _BEAM else 0.05)
         way /= np.sqrt(squared)
         cosine = np.maximum(-_dot(way, axis.astype(np.float32)), 0.0)
         strength = np.maximum(_dot(places.normals, way), 0.0) / squared

@@ -29,7 +29,10 @@ _MOSTLY = 6  # of eight directions
 
 
 def own_body(site: Site, kind: BodyKind, base_T_cameras: Sequence[Pose], seed: int) -> Mesh | None:
-    """Return the body in the base frame; None for none. Its roof is lowered until all cameras are outside."""
+    """Return the body in the base frame; None for none. Its roof is lowered until all cameras are outside.
+
+    ConfigError says so where a camera is too low for such a body.
+    """
     if kind == "none":
         return None
     dice = Dice(seed, 43)
@@ -41,7 +44,10 @@ def own_body(site: Site, kind: BodyKind, base_T_cameras: Sequence[Pose], seed: i
         model: VehicleKind = dice.pick("saloon", "estate", "suv", "hatchback") if kind == "car" else "van"
         body = car_mesh(site, model, dice.paint(), np.random.default_rng([seed, 47]))
     body = body.moved(x=middle)
-    return body.scaled(1.0, 1.0, _flattening(body, places))
+    factor = _flattening(body, places)
+    if factor < _FLATTEST:
+        raise ConfigError(f"body {kind}: a camera {places[:, 2].min():.2f} m above the ground would be inside of it")
+    return body.scaled(1.0, 1.0, factor)
 
 
 def _flattening(body: Mesh, cameras: Floats) -> float:
@@ -52,7 +58,7 @@ def _flattening(body: Mesh, cameras: Floats) -> float:
     hits: Hits = scene.nearest(above, down)
     tops = 10.0 - hits.distances
     factors = np.where(hits.faces >= 0, (cameras[:, 2] - _CLEAR) / np.maximum(tops, 0.1), 1.0)
-    return float(np.clip(factors.min(), _FLATTEST, 1.0))
+    return min(1.0, float(factors.min()))
 
 
 def _robot(site: Site, dice: Dice, cameras: Floats) -> Mesh:

@@ -147,6 +147,14 @@ def test_a_vehicle_that_starts_inside_a_wall_is_refused_by_name():
         SimulatedDrive(spec)
 
 
+def test_a_body_that_would_hide_a_low_camera_is_refused():
+    low = two_cameras()
+    mounts = [camera.base_T_camera for camera in low.complete().cameras]
+    mounts[1][2, 3] = 0.4
+    with pytest.raises(ConfigError, match=r"body car: a camera 0\.40 m above the ground would be inside of it"):
+        build_world(street_spec(), "car", mounts)
+
+
 @pytest.mark.parametrize("body", ["car", "van", "robot"])
 def test_the_own_body_is_below_the_cameras_and_seen_by_them(body: str):
     low = two_cameras()
