@@ -10,6 +10,7 @@ from cvcdepth_core.worlds.generation.dice import Dice
 from cvcdepth_core.worlds.generation.kinds import Kind
 from cvcdepth_core.worlds.generation.layout import Layout
 
+_OWN_WIDTH = 1.6  # metres beside the drive's middle that cones keep free
 _CLUTTER: dict[FurnitureKind, float] = {
     "bollard": 0.14, "bin": 0.16, "bench": 0.08, "cabinet": 0.1, "hydrant": 0.06, "shelter": 0.05, "planter": 0.09,
     "rock": 0.04, "post_box": 0.06, "parasol": 0.05, "crate": 0.07, "pole": 0.06, "billboard": 0.04,
@@ -143,6 +144,8 @@ def _road_works(world: WorldSpec, layout: Layout, dice: Dice) -> Iterator[Furnit
     name: FurnitureKind = dice.pick("cone", "barrel")
     s, step = layout.start + dice.between(8, 40), dice.between(1.5, 5.0)
     side = dice.pick(1.0, -1.0)
+    if abs(side * (layout.kerb(side) - 0.5) - world.drive.at[1]) < _OWN_WIDTH:
+        return
     for i in range(dice.whole(4, 12)):
         at = (round(s + i * step, 2), round(side * (layout.kerb(side) - 0.5), 2))
         if layout.take(at, (0.5, 0.5), 0.0, 0, None):
