@@ -16,7 +16,7 @@ pytest.importorskip("embreex", reason="worlds need embreex")
 
 LENS = Calibration(width=160, height=96, k=(90, 0, 79.5, 0, 90, 47.5, 0, 0, 1))
 K = LENS.raw_intrinsics
-MEDIAN_BOUND = 0.02
+MEDIAN_BOUND = 0.015
 """Of the difference of pictures in [0, 1], over static pixels that both show."""
 
 
