@@ -65,10 +65,10 @@ def _along_streets(kind: Kind, layout: Layout, dice: Dice, species: list[_Specie
         height = dice.between(3.5, 11.0) * chosen.size
         for side in (1.0, -1.0):
             kerb, edge = layout.kerb(side, road), layout.edge(side, road)
-            l = kerb + 0.8 if edge - kerb > 1.7 else edge + dice.between(0.8, 3.0)  # noqa: E741
+            lateral = kerb + 0.8 if edge - kerb > 1.7 else edge + dice.between(0.8, 3.0)
             s, last = layout.span(road)
             while s < last:
-                at = (round(s + dice.normal(0.4), 2), round(side * l, 2))
+                at = (round(s + dice.normal(0.4), 2), round(side * lateral, 2))
                 if dice.chance(0.85) and layout.take(at, (0.6, 0.6), 0.0, road, 0.3):
                     yield _tree(dice, chosen, at, road, height * dice.between(0.75, 1.15))
                 s += gap
@@ -137,12 +137,12 @@ def _line(kind: Kind, layout: Layout, dice: Dice, road: int, side: float) -> Ite
     barrier = _barrier(kind, dice)
     stop = dice.between(10, 90) + s
     while s < last:
-        l = side * (layout.edge(side, road) + away)  # noqa: E741
-        room = layout.take((s + 1.25, l), (2.4, 0.5), 0.0, road, 0.1, pavements=True)
+        lateral = side * (layout.edge(side, road) + away)
+        room = layout.take((s + 1.25, lateral), (2.4, 0.5), 0.0, road, 0.1, pavements=True)
         if room:
             run.append(s)
         if run and (not room or s > stop or s + 2.5 >= last):
-            ends = ((round(run[0], 2), round(l, 2)), (round(run[-1] + 2.5, 2), round(l, 2)))
+            ends = ((round(run[0], 2), round(lateral, 2)), (round(run[-1] + 2.5, 2), round(lateral, 2)))
             yield barrier.model_copy(update={"line": ends, "road": road, "seed": dice.seed()})
             run = []
         if s > stop:

@@ -41,8 +41,8 @@ def _row(kind: Kind, layout: Layout, dice: Dice, road: int, side: float) -> Iter
         length = dice.between(*kind.lengths, digits=1)
         depth = dice.between(8.0, 16.0, 1) if kind.lengths[1] < 35 else dice.between(12, 30, 1)
         own = setback + (dice.between(0, 0.25 * kind.setback[1]) if dice.chance(0.3) else 0.0)
-        l = round(side * (layout.edge(side, road) + own + 0.15 + depth / 2), 2)  # noqa: E741
-        at = (round(s + length / 2, 2), l)
+        lateral = round(side * (layout.edge(side, road) + own + 0.15 + depth / 2), 2)
+        at = (round(s + length / 2, 2), lateral)
         if dice.chance(kind.buildings) and layout.take(at, (length, depth), 0.0, road, 0.1, pavements=True):
             height = round(max(2.7, typical * dice.scale(0.65, 1.5)), 1)
             turn = 180.0 if side > 0 else 0.0

@@ -3,11 +3,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from cvcdepth_core.worlds.description import (
-    Barrier,
-    Furniture,
     Patch,
     Structure,
     StructureKind,
@@ -27,9 +25,7 @@ class Special:
 
     patches: tuple[Patch, ...] = ()
     structures: tuple[Structure, ...] = ()
-    barriers: tuple[Barrier, ...] = ()
-    furniture: tuple[Furniture, ...] = ()
-    vehicles: tuple[Vehicle, ...] = field(default=())
+    vehicles: tuple[Vehicle, ...] = ()
 
 
 def special_places(world: WorldSpec, layout: Layout, dice: Dice) -> Special:
@@ -74,16 +70,16 @@ def _parking_deck(world: WorldSpec, layout: Layout, dice: Dice, special: Special
     special.structures += (Structure(kind="deck", at=(round((first + last) / 2), 0.0), size=size, colour=colour),)
     share = dice.between(0.2, 0.9)
     for row in (-1, 1):
-        l = row * (width / 2 - 3.2)  # noqa: E741
+        lateral = row * (width / 2 - 3.2)
         patch = Patch(
-            at=(round((first + last) / 2), round(l, 1)), size=(size[0] - 2, 5.2), surface=world.roads[0].surface,
+            at=(round((first + last) / 2), round(lateral, 1)), size=(size[0] - 2, 5.2), surface=world.roads[0].surface,
             colour=world.roads[0].colour, bays=2.5,
         )  # fmt: skip
         special.patches += (patch,)
         s = first + 7.0
         while s < last - 7:
             kind: VehicleKind = dice.pick("hatchback", "saloon", "suv", "estate")
-            at = (round(s, 2), round(l, 2))
+            at = (round(s, 2), round(lateral, 2))
             if dice.chance(share) and layout.take(at, (LENGTHS[kind], 2.2), 90.0, 0, None):
                 yaw = dice.pick(90.0, 270.0) + dice.normal(1.0)
                 special.vehicles += (

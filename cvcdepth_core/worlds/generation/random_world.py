@@ -107,14 +107,14 @@ class _Author:
         dice, road = self.dice, roads[0]
         own_lanes = road.lanes if road.one_way else max(1, road.lanes // 2)
         lane = dice.whole(0, own_lanes - 1) if road.lanes else 0
-        l = -(road.lanes / 2 - lane - 0.5) * road.lane_width if road.lanes else 0.0  # noqa: E741
-        l = round(l + dice.normal(0.2), 2)  # noqa: E741
+        lateral = -(road.lanes / 2 - lane - 0.5) * road.lane_width if road.lanes else 0.0
+        lateral = round(lateral + dice.normal(0.2), 2)
         if not self.kind.lanes[0] and road.lanes == 0:
-            l = dice.between(-3, 3)  # noqa: E741
-        bends = self._turn(road, l) if len(roads) > 1 and road.bends[0][1] == 0 and dice.chance(0.35) else None
-        return Drive(at=(_BEHIND, l), speeds=speeds, bends=bends)
+            lateral = dice.between(-3, 3)
+        bends = self._turn(road, lateral) if len(roads) > 1 and road.bends[0][1] == 0 and dice.chance(0.35) else None
+        return Drive(at=(_BEHIND, lateral), speeds=speeds, bends=bends)
 
-    def _turn(self, road: Road, l: float) -> tuple[tuple[float, float], ...]:  # noqa: E741
+    def _turn(self, road: Road, lateral: float) -> tuple[tuple[float, float], ...]:
         """Turn into the crossing road, to the right or left, at the crossing's lane."""
         to_left = self.dice.chance(0.5)
         crossing = _BEHIND + self.kind.crossing_at

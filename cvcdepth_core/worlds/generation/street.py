@@ -46,13 +46,13 @@ def _lamps(kind: Kind, layout: Layout, dice: Dice) -> Iterator[Furniture]:
             dice.pick((1.0, -1.0), (1.0,), (-1.0,)),
         )
         for side in sides:
-            l = _beside(layout, side, dice, road)  # noqa: E741
+            lateral = _beside(layout, side, dice, road)
             s, last = layout.span(road)
             while s < last:
-                if layout.take((s, l), (0.4, 0.4), 0.0, road, 0.15):
+                if layout.take((s, lateral), (0.4, 0.4), 0.0, road, 0.15):
                     yield Furniture(
                         kind="lamp",
-                        at=(round(s, 1), l),
+                        at=(round(s, 1), lateral),
                         yaw=0.0 if side < 0 else 180.0,
                         road=road,
                         height=height,
@@ -66,11 +66,11 @@ def wires(kind: Kind, layout: Layout, dice: Dice) -> tuple[tuple[Wires, ...], tu
     if not dice.chance(kind.wires):
         return (), ()
     side, gap, height = dice.pick(1.0, -1.0), dice.between(22, 42, 0), dice.between(7.0, 10.5, 1)
-    l = _beside(layout, side, dice)  # noqa: E741
+    lateral = _beside(layout, side, dice)
     s, last = layout.span()
     line, poles = [], []
     while s < last:
-        at = (round(s, 1), l)
+        at = (round(s, 1), lateral)
         if layout.take(at, (0.5, 0.5), 0.0, 0, 0.15):
             line.append(at)
             poles.append(Furniture(kind="power_pole", at=at, height=height, seed=dice.seed()))

@@ -55,9 +55,9 @@ def traffic(world: WorldSpec, kind: Kind, layout: Layout, dice: Dice, seconds: f
 
 def _lane(world: WorldSpec, layout: Layout, dice: Dice, road: int, lane: int, share: float) -> Iterator[Vehicle]:
     spec, drive = world.roads[road], world.drive
-    l = (lane + 0.5 - spec.lanes / 2) * spec.lane_width  # noqa: E741
-    forward = spec.one_way or l < 0 or spec.lanes == 1
-    own = road == 0 and abs(l - drive.at[1]) < spec.lane_width / 2
+    lateral = (lane + 0.5 - spec.lanes / 2) * spec.lane_width
+    forward = spec.one_way or lateral < 0 or spec.lanes == 1
+    own = road == 0 and abs(lateral - drive.at[1]) < spec.lane_width / 2
     crossing = len(world.roads) > 1
     speeds = _speeds(world, dice, own, crossing and road == 1)
     if own and drive.bends is not None:
@@ -74,7 +74,7 @@ def _lane(world: WorldSpec, layout: Layout, dice: Dice, road: int, lane: int, sh
             crossing and _near_crossing(world, layout, middle, road)
         )
         if room and dice.chance(share):
-            at = (round(middle, 2), round(l + dice.normal(0.15), 2))
+            at = (round(middle, 2), round(lateral + dice.normal(0.15), 2))
             motion = Motion(speeds=speeds)
             yield Vehicle(
                 kind=name,
@@ -168,9 +168,9 @@ def _on_place(world: WorldSpec, layout: Layout, dice: Dice, share: float) -> Ite
     kinds = _WORKS if world.kind == "yard" else _PARKED
     for _ in range(int(70 * share)):
         name: VehicleKind = dice.weighted(kinds)
-        l = dice.pick(-1, 1) * dice.between(4.5, max(4.6, half - 2.0))  # noqa: E741
+        lateral = dice.pick(-1, 1) * dice.between(4.5, max(4.6, half - 2.0))
         at, yaw = (
-            (dice.between(first, last, 1), round(l, 1)),
+            (dice.between(first, last, 1), round(lateral, 1)),
             dice.pick(0.0, 90.0, 180.0, 270.0, dice.between(0, 360, 0)),
         )
         if layout.take(at, (LENGTHS[name] + 0.4, _WIDTH + 0.7), yaw, 0, None):

@@ -53,17 +53,6 @@ class Mesh:
         length = np.linalg.norm(normals, axis=-1, keepdims=True)
         return replace(self, vertices=self.vertices * (x, y, z), normals=normals / np.where(length > 0, length, 1.0))
 
-    def mirrored(self) -> Mesh:
-        """Return its mirror image in the plane y = 0."""
-        flip = np.array([1.0, -1.0, 1.0])
-        return Mesh(
-            self.vertices * flip,
-            self.faces[:, ::-1],
-            self.uv[:, ::-1],
-            self.normals[:, ::-1] * flip,
-            self.materials,
-        )
-
     def smoothed(self, crease: float = 40.0) -> Mesh:
         """Return it with smooth normals over edges whose faces differ by less than `crease` degrees."""
         return replace(self, normals=_smooth_normals(self, math.cos(math.radians(crease))))

@@ -78,8 +78,8 @@ class _RoadBuilder:
             if len(stations) < 2:
                 continue
             yield self._strip(across, np.full(3, up), top, stations)
-            for l in (inner, outer):  # noqa: E741
-                yield self._strip(np.array([l, l]), np.array([down, up]), sides, stations, upright=True)
+            for lateral in (inner, outer):
+                yield self._strip(np.array([lateral, lateral]), np.array([down, up]), sides, stations, upright=True)
             for s in (stations[0], stations[-1]):
                 yield self._end(s, inner, outer, down, up, sides)
 
@@ -96,8 +96,8 @@ class _RoadBuilder:
         heights = down + lift * np.array([1.0, 1.0, 0.5, 0.0])
         across = edge + side * out
         busy = np.zeros(len(self.stations), bool)
-        for l in across:  # noqa: E741
-            points = self.corridor.path.points(self.stations, l)
+        for lateral in across:
+            points = self.corridor.path.points(self.stations, lateral)
             for other in self.others:
                 busy |= other.depth(points) > -0.3
         for run in _runs(~busy):
@@ -118,24 +118,24 @@ class _RoadBuilder:
         world_texture: bool = False,
     ) -> Mesh:
         """Surface over stations x lateral places; texture coordinates are s and l (height if `upright`) or x and y."""
-        s, l = np.meshgrid(stations, across, indexing="ij")  # noqa: E741
-        points = self._drape(s.reshape(-1), l.reshape(-1))
+        s, lateral = np.meshgrid(stations, across, indexing="ij")
+        points = self._drape(s.reshape(-1), lateral.reshape(-1))
         points[:, 2] += np.tile(heights, len(stations))
-        second = np.broadcast_to(heights, s.shape) if upright else l
+        second = np.broadcast_to(heights, s.shape) if upright else lateral
         uv = points[:, :2].reshape(*s.shape, 2) if world_texture else np.stack([s, second], axis=-1)
         mesh = grid(points.reshape(*s.shape, 3), uv, material)
         return mesh if across[0] > across[-1] else _reversed(mesh)
 
-    def _drape(self, s: Floats, l: Floats) -> Floats:  # noqa: E741
+    def _drape(self, s: Floats, lateral: Floats) -> Floats:
         """Points [N, 3] on the ground at s and l [N]."""
-        xy = self.corridor.path.points(s, l)
+        xy = self.corridor.path.points(s, lateral)
         found: Floats = np.c_[xy, self.site.terrain.height(xy) - self.number * _LATER]
         return found
 
     def _in_other_carriageway(self, stations: Floats, across: Floats, margin: float) -> Floats:
         """Whether places lie on another road, [stations, across]."""
-        s, l = np.meshgrid(stations, across, indexing="ij")  # noqa: E741
-        points = self.corridor.path.points(s.reshape(-1), l.reshape(-1))
+        s, lateral = np.meshgrid(stations, across, indexing="ij")
+        points = self.corridor.path.points(s.reshape(-1), lateral.reshape(-1))
         found = np.zeros(len(points), bool)
         for other in self.others:
             found |= _on_carriageway(other, points, margin)
@@ -150,25 +150,25 @@ class _RoadBuilder:
         white, half = self._paint((0.68, 0.68, 0.66)), road.lanes * road.lane_width / 2
         centre = 0.0 if not road.one_way and road.lanes % 2 == 0 else None
         for i in range(1, road.lanes):
-            l = -half + i * road.lane_width  # noqa: E741
-            if centre is not None and abs(l - centre) < 0.1:
-                yield from self._centre_line(l)
+            lateral = -half + i * road.lane_width
+            if centre is not None and abs(lateral - centre) < 0.1:
+                yield from self._centre_line(lateral)
             else:
-                yield from self._line(l, 0.12, white, dashed=True)
+                yield from self._line(lateral, 0.12, white, dashed=True)
         if road.edge_lines:
-            for l in (-half + 0.1, half - 0.1):  # noqa: E741
-                yield from self._line(l, 0.13, white)
+            for lateral in (-half + 0.1, half - 0.1):
+                yield from self._line(lateral, 0.13, white)
 
-    def _centre_line(self, l: float) -> Iterator[Mesh]:  # noqa: E741
+    def _centre_line(self, lateral: float) -> Iterator[Mesh]:
         paint, kind = self._paint(self.road.centre_colour), self.road.centre_line
         if kind == "double":
-            yield from self._line(l - 0.13, 0.11, paint)
-            yield from self._line(l + 0.13, 0.11, paint)
+            yield from self._line(lateral - 0.13, 0.11, paint)
+            yield from self._line(lateral + 0.13, 0.11, paint)
         elif kind != "none":
-            yield from self._line(l, 0.13, paint, dashed=kind == "dashed")
+            yield from self._line(lateral, 0.13, paint, dashed=kind == "dashed")
 
-    def _line(self, l: float, width: float, paint: int, dashed: bool = False) -> Iterator[Mesh]:  # noqa: E741
-        across = np.array([l - width / 2, l + width / 2])
+    def _line(self, lateral: float, width: float, paint: int, dashed: bool = False) -> Iterator[Mesh]:
+        across = np.array([lateral - width / 2, lateral + width / 2])
         spans = [(0.0, self.corridor.path.length)]
         if dashed:
             spans = [(s, s + _DASH) for s in np.arange(1.0, self.corridor.path.length - _DASH, _DASH + _GAP)]
@@ -185,8 +185,10 @@ class _RoadBuilder:
         paint = self._paint((0.7, 0.7, 0.68))
         right, left = self.corridor.carriageway
         for s in self.road.crossings:
-            for l in np.arange(right + 0.4, left - 0.4, 1.0):  # noqa: E741
-                yield self._strip(np.array([l, l + 0.5]), np.full(2, _PAINT), paint, np.linspace(s - 1.7, s + 1.7, 4))
+            for lateral in np.arange(right + 0.4, left - 0.4, 1.0):
+                yield self._strip(
+                    np.array([lateral, lateral + 0.5]), np.full(2, _PAINT), paint, np.linspace(s - 1.7, s + 1.7, 4)
+                )
             for sign in (-1.0, 1.0):
                 half = np.array([right + 0.1, -0.1]) if sign < 0 else np.array([0.1, left - 0.1])
                 along = np.array([s + sign * 3.0, s + sign * 3.35])
@@ -198,11 +200,11 @@ class _RoadBuilder:
         faces = [(0, 1, 5), (0, 5, 6), (2, 3, 4)]
         for s in road.arrows:
             for i in range(road.lanes):
-                l = (i + 0.5 - road.lanes / 2) * road.lane_width  # noqa: E741
-                forward = 1.0 if road.one_way or l < 0 else -1.0
-                places = outline * forward + (s, l)
+                lateral = (i + 0.5 - road.lanes / 2) * road.lane_width
+                forward = 1.0 if road.one_way or lateral < 0 else -1.0
+                places = outline * forward + (s, lateral)
                 points = self._drape(places[:, 0], places[:, 1]) + np.array([0, 0, _PAINT])
-                if not self._in_other_carriageway(np.array([s]), np.array([l]), 3.0).any():
+                if not self._in_other_carriageway(np.array([s]), np.array([lateral]), 3.0).any():
                     yield flat_mesh(points, faces, paint)
 
     def _covers(self) -> Iterator[Mesh]:
@@ -214,8 +216,10 @@ class _RoadBuilder:
         iron = self.site.material(plain((0.06, 0.058, 0.055), 2.0))
         angles = np.linspace(0.0, 2 * math.pi, 12, endpoint=False)
         for _ in range(int(self.corridor.path.length / 30 * 2 * self.road.wear)):
-            s, l = rng.uniform(2, self.corridor.path.length - 2), rng.uniform(right + 0.5, left - 0.5)  # noqa: E741
-            points = self._drape(s + 0.33 * np.cos(angles), l + 0.33 * np.sin(angles)) + np.array([0, 0, _PAINT / 2])
+            s, lateral = rng.uniform(2, self.corridor.path.length - 2), rng.uniform(right + 0.5, left - 0.5)
+            points = self._drape(s + 0.33 * np.cos(angles), lateral + 0.33 * np.sin(angles)) + np.array(
+                [0, 0, _PAINT / 2]
+            )
             yield flat_mesh(points, [(0, k, k + 1) for k in range(1, 11)], iron)
 
     def _paint(self, colour: Colour) -> int:
@@ -224,9 +228,9 @@ class _RoadBuilder:
 
 
 def _on_carriageway(corridor: Corridor, points: Floats, margin: float) -> Floats:
-    s, l = corridor.path.locate(points)  # noqa: E741
+    s, lateral = corridor.path.locate(points)
     right, left = corridor.carriageway
-    between = (l > right - margin) & (l < left + margin)
+    between = (lateral > right - margin) & (lateral < left + margin)
     return between & (s > -margin) & (s < corridor.path.length + margin)
 
 

@@ -65,7 +65,6 @@ _SHAPES: dict[VehicleKind, _Shape] = {
     "pickup": _Shape(5.4, 1.92, 1.83, 1.02, 1.18, 1.1, 0.7, (0.4, 0.53), 0.37, 0.28, 0.39, (0.22, 0.82), 0.4),
 }
 _TYRE_WIDTH = 0.22
-_DETAIL_FROM_SKIN = 0.012
 
 
 def build_vehicles(site: Site) -> None:

@@ -289,7 +289,7 @@ def _road(surface: Surface, chosen: Ints, place: _Place) -> None:
 
 
 def _facade(surface: Surface, chosen: Ints, place: _Place) -> None:
-    f = FacadeParameters(*(place.parameter(i) for i in range(_PARAMETERS)))  # type: ignore[arg-type]
+    f = FacadeParameters._make(place.parameter(i) for i in range(_PARAMETERS))  # each an array of all places
     cell = _facade_cell(place, f)
     wall = _wall_colour(place, surface.colour[:, chosen], f) * cell.relief
     sharp = place.sharpness(np.asarray(f.bay) * 0.25)
