@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -51,6 +51,10 @@ class SurroundMoment:
     def world_T_camera(self) -> NDArray[np.float64]:
         """[N, 4, 4] the cameras' poses at their exposures; in the base frame where the motion is not known."""
         return self.base_T_camera if self.world_T_base is None else self.world_T_base @ self.base_T_camera
+
+    def with_depth(self, depth: NDArray[np.float32]) -> SurroundMoment:
+        """Return the same set with other depth [N, H, W]."""
+        return replace(self, depth=depth)
 
     @property
     def time_ns(self) -> int:
