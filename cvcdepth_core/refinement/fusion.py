@@ -14,9 +14,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from cvcdepth_core.refinement.confidence import RIGHT_WITHIN
 from cvcdepth_core.refinement.settings import RefinementSettings
 
-_RIGHT_WITHIN = 0.2231435513142097  # log 1.25: depth within this counts as right, as in the metric delta < 1.25
 _LEAST_LOG_RATIO = 1e-4  # below is rounding: the prior stays bit for bit
 
 
@@ -38,7 +38,7 @@ def posterior(cost: Tensor, settings: RefinementSettings) -> Posterior:
     log_ratios = settings.log_ratios(cost.device)
     log_ratio, peak = _peak_mean(probability, log_ratios)
     log_ratio = torch.where(log_ratio.abs() < _LEAST_LOG_RATIO, 0.0, log_ratio)
-    near = log_ratios.abs() <= _RIGHT_WITHIN
+    near = log_ratios.abs() <= RIGHT_WITHIN
     return Posterior(log_ratio, peak, probability[:, near].sum(1))
 
 

@@ -47,7 +47,9 @@ class SweepCost(NamedTuple):
     cost: Tensor
     """[bins, h, w] mean of 1 - ZNCC times `evidence`; 0 where no source sees the pixel."""
     evidence: Tensor
-    """[h, w] in [0, 1]: how much parallax there is; 0 where nothing could be compared."""
+    """[h, w] in [0, 1]: whether there is parallax enough; 0 where nothing could be compared."""
+    fineness: Tensor
+    """[h, w] in [0, 1]: below `evidence` where all sources move by many pixels from one hypothesis to the next."""
 
 
 def sweep(view: View, depth: Tensor, sources: Sequence[View], log_ratios: Tensor) -> SweepCost:
@@ -55,13 +57,13 @@ def sweep(view: View, depth: Tensor, sources: Sequence[View], log_ratios: Tensor
     reference = _Reference.of(view, depth)
     hypotheses = (-log_ratios).exp()[:, None, None]
     likeness = depth.new_zeros(len(log_ratios), *depth.shape)
-    weights = torch.zeros_like(likeness)
+    weights, evidence = torch.zeros_like(likeness), torch.zeros_like(depth)
     for source in sources:
         geometry = _Geometry.between(view, source)
         window = _seen_window(reference.nearness, geometry, hypotheses[:: len(hypotheses) // 4])
         if window is not None:
-            _add_source(reference.cut(window), source.grey, geometry, hypotheses, likeness, weights)
-    return _combined(likeness, weights)
+            _add_source(reference.cut(window), source.grey, geometry, hypotheses, _Sums(likeness, weights, evidence))
+    return _combined(_Sums(likeness, weights, evidence))
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,20 +147,28 @@ class _Reference:
         )
 
 
-def _add_source(
-    reference: _Reference,
-    grey: Tensor,
-    geometry: _Geometry,
-    hypotheses: Tensor,
-    likeness: Tensor,
-    weights: Tensor,
-) -> None:
-    """Add what one source says, weighted by its parallax, to `likeness` and `weights` [bins, h, w]."""
+class _Sums(NamedTuple):
+    """What is added up over the sources."""
+
+    likeness: Tensor
+    """[bins, h, w] ZNCC times weight."""
+    weights: Tensor
+    """[bins, h, w] of the sources that see the hypothesis."""
+    evidence: Tensor
+    """[h, w] by parallax, times the share of the hypotheses that are seen."""
+
+
+def _add_source(reference: _Reference, grey: Tensor, geometry: _Geometry, hypotheses: Tensor, sums: _Sums) -> None:
+    """Add what one source says to the sums, where it sees something."""
     grid = _sampling_grid(reference, geometry, hypotheses)
-    weight = _parallax_weight(_parallax(grid, geometry, hypotheses) * (_PARALLAX_WIDTH / reference.full_width))
+    parallax = _parallax(grid, geometry, hypotheses) * (_PARALLAX_WIDTH / reference.full_width)
+    evidence = (parallax / _LEAST_PARALLAX).clamp_(max=1.0).square_()
+    weight = evidence * (_LARGEST_PARALLAX / parallax.clamp_(min=_LARGEST_PARALLAX)).square_()
     correlation = _correlation(reference, _sampled(grey, grid))
-    weights[reference.inner] += torch.where(torch.isnan(correlation), 0.0, weight)
-    likeness[reference.inner] += correlation.nan_to_num_(0.0).mul_(weight)
+    unseen = torch.isnan(correlation)
+    sums.weights[reference.inner] += torch.where(unseen, 0.0, weight)
+    sums.likeness[reference.inner] += correlation.nan_to_num_(0.0).mul_(weight)
+    sums.evidence[reference.inner[1:]] += evidence * (1 - unseen.float().mean(0))
 
 
 def _sampling_grid(reference: _Reference, geometry: _Geometry, hypotheses: Tensor) -> Tensor:
@@ -220,14 +230,7 @@ def _parallax(grid: Tensor, geometry: _Geometry, hypotheses: Tensor) -> Tensor:
     step = grid[:, middle + 1, inner, inner] - grid[:, middle - 1, inner, inner]
     across, down = (half * part for half, part in zip(geometry.half_size, step, strict=True))
     log_step = (hypotheses[middle - 1] / hypotheses[middle + 1]).log()
-    return torch.hypot(across, down) / log_step
-
-
-def _parallax_weight(parallax: Tensor) -> Tensor:
-    """Return a source's weight: little where it hardly moves, and where one bin is many pixels."""
-    few = (parallax / _LEAST_PARALLAX).clamp(max=1.0)
-    many = (_LARGEST_PARALLAX / parallax.clamp(min=_TINY)).clamp(max=1.0)
-    return (few * many).square_().nan_to_num_(0.0)
+    return torch.hypot(across, down).div_(log_step).nan_to_num_(0.0)
 
 
 def _seen_window(nearness: Tensor, geometry: _Geometry, hypotheses: Tensor) -> tuple[slice, slice] | None:
@@ -255,10 +258,21 @@ def _span(seen: Tensor, size: int) -> slice | None:
     return slice(first, last) if last - first > PATCH else None
 
 
-def _combined(likeness: Tensor, weights: Tensor) -> SweepCost:
+def _combined(sums: _Sums) -> SweepCost:
     """Average over sources; a hypothesis that none sees costs what its pixel's others do on average: it is neutral."""
-    evidence = weights.mean(0).clamp_(max=1.0)
-    likeness.div_(weights.clamp(min=_TINY))
-    seen = weights > 0
+    evidence = sums.evidence.clamp(max=1.0)
+    likeness = sums.likeness / sums.weights.clamp(min=_TINY)
+    seen = sums.weights > 0
     mean = likeness.sum(0) / seen.sum(0).clamp(min=1)
-    return SweepCost((1 - torch.where(seen, likeness, mean)).mul_(evidence), evidence)
+    cost = (1 - torch.where(seen, likeness, mean)).mul_(evidence)
+    fineness = sums.weights.mean(0).clamp_(max=1.0)
+    return SweepCost(_to_border(cost), _to_border(evidence), _to_border(fineness))
+
+
+def _to_border(values: Tensor) -> Tensor:
+    """Take the outermost middles of patches [..., h, w] on to the border, in place: those patches cover it."""
+    values[..., :_MARGIN, :] = values[..., _MARGIN : _MARGIN + 1, :]
+    values[..., -_MARGIN:, :] = values[..., -_MARGIN - 1 : -_MARGIN, :]
+    values[..., :_MARGIN] = values[..., _MARGIN : _MARGIN + 1]
+    values[..., -_MARGIN:] = values[..., -_MARGIN - 1 : -_MARGIN]
+    return values

@@ -11,12 +11,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cvcdepth_core.refinement.confidence import PRIOR_CONFIDENCE, REFINED_CONFIDENCE, ConfidenceMap, raw_confidence
 from cvcdepth_core.refinement.fusion import posterior
 from cvcdepth_core.refinement.history import History
 from cvcdepth_core.refinement.moments import GridSet, SurroundMoment, enlarged, to_grid
 from cvcdepth_core.refinement.movers import guard_cost
 from cvcdepth_core.refinement.plane_sweep import SweepCost, View, sweep
 from cvcdepth_core.refinement.settings import RefinementSettings
+
+_LEAST_EVIDENCE = 0.05
+"""Below, parallax is too little to tell anything: the prior stays bit for bit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,27 +68,32 @@ class SurroundRefiner:
         return refined
 
     def _refined(self, moment: SurroundMoment, grid: GridSet) -> RefinedDepth:
-        cost, evidence = self._costs(moment, grid)
-        found = posterior(cost, self.settings)
-        checked = (evidence > 0) & ~torch.isnan(grid.depth)
-        log_ratio = enlarged(torch.where(checked, found.log_ratio, 0.0), grid.reduction)
-        confidences = (enlarged(torch.where(checked, c, 0.0), grid.reduction) for c in (found.peak, found.prior_right))
+        swept = self._swept_all(moment, grid)
+        found = posterior(swept.cost, self.settings)
+        checked = (swept.evidence >= _LEAST_EVIDENCE) & ~torch.isnan(grid.depth)
         depth = torch.from_numpy(moment.depth).to(self._device)
-        known = ~torch.isnan(depth)
-        confidence, prior_confidence = (_to_numpy(c * known) for c in confidences)
+        raw = raw_confidence(found.peak, found.log_ratio, swept.fineness)
+
+        def on_picture(values: Tensor) -> Tensor:
+            return enlarged(torch.where(checked, values, 0.0), grid.reduction)
+
+        def confidence(raw: Tensor, mapped: ConfidenceMap) -> NDArray[np.float32]:
+            return _to_numpy(on_picture(mapped(raw)) * ~torch.isnan(depth))
+
         return RefinedDepth(
-            _to_numpy(depth * log_ratio.exp()),
-            confidence,
-            prior_confidence,
-            _to_numpy(checked.float().mean((1, 2))),
+            depth=_to_numpy(depth * on_picture(found.log_ratio).exp()),
+            confidence=confidence(raw, REFINED_CONFIDENCE),
+            prior_confidence=confidence(found.prior_right, PRIOR_CONFIDENCE),
+            checked=_to_numpy(checked.float().mean((1, 2))),
         )
 
-    def _costs(self, moment: SurroundMoment, grid: GridSet) -> tuple[Tensor, Tensor]:
-        """Return the cost [N, bins, h, w] of every hypothesis, the prior's included, and the evidence [N, h, w]."""
-        swept = [self._swept(moment, grid, camera) for camera in range(len(grid.depth))]
-        cost = torch.stack([found.cost for found in swept])
+    def _swept_all(self, moment: SurroundMoment, grid: GridSet) -> SweepCost:
+        """Return what is known of all cameras, stacked [N, ...]; costs include the prior's."""
+        swept = (self._swept(moment, grid, camera) for camera in range(len(grid.depth)))
+        found = SweepCost(*(torch.stack(parts) for parts in zip(*swept, strict=True)))
         prior = self.settings.prior_weight * self.settings.log_ratios(self._device).abs()
-        return cost.add_(prior[:, None, None]), torch.stack([found.evidence for found in swept])
+        found.cost.add_(prior[:, None, None])
+        return found
 
     def _swept(self, moment: SurroundMoment, grid: GridSet, camera: int) -> SweepCost:
         log_ratios = self.settings.log_ratios(self._device)
