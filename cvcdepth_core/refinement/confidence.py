@@ -20,6 +20,7 @@ RIGHT_WITHIN = math.log(1.25)
 """Log ratio within which depth counts as right, as in the metric delta < 1.25."""
 
 _BY_FINENESS, _BY_LOG_RATIO = 0.05, 0.06
+_LEAST_CONTRAST = 0.05
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,15 @@ def raw_confidence(peak: Tensor, log_ratio: Tensor, fineness: Tensor) -> Tensor:
     coarse. The two small exponents were chosen by AUSE on sets 14 to 29 of the sample recording.
     """
     return peak * fineness.clamp(min=1e-3).pow(_BY_FINENESS) * (-_BY_LOG_RATIO * log_ratio.abs()).exp()
+
+
+def checked_share(contrast: Tensor) -> Tensor:
+    """Return how far texture allows a check, in [0, 1]: 0 where it shows nothing, 1 where it shows a little.
+
+    `contrast` is the cost's, averaged over some pixels. What is smooth between textured places is often right, but
+    nobody has looked.
+    """
+    return (contrast / _LEAST_CONTRAST).clamp(max=1.0)
 
 
 def fit_confidence_map(raw: NDArray[np.floating], right: NDArray[np.bool_], knots: int = 12) -> ConfidenceMap:

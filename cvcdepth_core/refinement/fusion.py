@@ -33,7 +33,7 @@ class Posterior(NamedTuple):
 
 def posterior(cost: Tensor, settings: RefinementSettings) -> Posterior:
     """Read log ratios out of `cost` [N, bins, h, w], which includes what is known of the prior."""
-    smooth = _averaged(semi_global(cost, settings.step_penalty), settings.smoothing)
+    smooth = averaged(semi_global(cost, settings.step_penalty), settings.smoothing)
     probability = torch.softmax(smooth.div_(-settings.temperature), dim=1)
     log_ratios = settings.log_ratios(cost.device)
     log_ratio, peak = _peak_mean(probability, log_ratios)
@@ -71,12 +71,12 @@ def _scan(lines: Tensor, step_penalty: float) -> Tensor:
     return lines
 
 
-def _averaged(cost: Tensor, share: float) -> Tensor:
-    """Average `cost` [N, bins, h, w] over squares whose edge is about `share` of the width, an odd number of pixels."""
-    half = round((share * cost.shape[-1] - 1) / 2)
+def averaged(values: Tensor, share: float) -> Tensor:
+    """Average `values` [N, ..., h, w] over squares whose edge is about `share` of the width, an odd number of pixels."""
+    half = round((share * values.shape[-1] - 1) / 2)
     if half < 1:
-        return cost
-    return torch.stack([_box_mean(_box_mean(camera, half, -2), half, -1) for camera in cost])
+        return values
+    return torch.stack([_box_mean(_box_mean(camera, half, -2), half, -1) for camera in values])
 
 
 def _box_mean(values: Tensor, half: int, dim: int) -> Tensor:

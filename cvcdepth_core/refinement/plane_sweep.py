@@ -50,6 +50,8 @@ class SweepCost(NamedTuple):
     """[h, w] in [0, 1]: whether there is parallax enough; 0 where nothing could be compared."""
     fineness: Tensor
     """[h, w] in [0, 1]: below `evidence` where all sources move by many pixels from one hypothesis to the next."""
+    contrast: Tensor
+    """[h, w] difference of the dearest and the cheapest hypothesis: 0 where pictures show no texture."""
 
 
 def sweep(view: View, depth: Tensor, sources: Sequence[View], log_ratios: Tensor) -> SweepCost:
@@ -266,7 +268,8 @@ def _combined(sums: _Sums) -> SweepCost:
     mean = likeness.sum(0) / seen.sum(0).clamp(min=1)
     cost = (1 - torch.where(seen, likeness, mean)).mul_(evidence)
     fineness = sums.weights.mean(0).clamp_(max=1.0)
-    return SweepCost(_to_border(cost), _to_border(evidence), _to_border(fineness))
+    contrast = cost.amax(0) - cost.amin(0)
+    return SweepCost(*(_to_border(part) for part in (cost, evidence, fineness, contrast)))
 
 
 def _to_border(values: Tensor) -> Tensor:

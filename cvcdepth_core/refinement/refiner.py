@@ -11,14 +11,22 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cvcdepth_core.refinement.confidence import PRIOR_CONFIDENCE, REFINED_CONFIDENCE, ConfidenceMap, raw_confidence
-from cvcdepth_core.refinement.fusion import posterior
+from cvcdepth_core.refinement.confidence import (
+    PRIOR_CONFIDENCE,
+    REFINED_CONFIDENCE,
+    ConfidenceMap,
+    checked_share,
+    raw_confidence,
+)
+from cvcdepth_core.refinement.fusion import averaged, posterior
 from cvcdepth_core.refinement.history import History
 from cvcdepth_core.refinement.moments import GridSet, SurroundMoment, enlarged, to_grid
 from cvcdepth_core.refinement.movers import guard_cost
 from cvcdepth_core.refinement.plane_sweep import SweepCost, View, sweep
 from cvcdepth_core.refinement.settings import RefinementSettings
 
+_CONTRAST_SHARE = 0.055
+"""Edge of the square in which there must be texture for a check, as a share of the grid's width."""
 _LEAST_EVIDENCE = 0.05
 """Below, parallax is too little to tell anything: the prior stays bit for bit."""
 
@@ -73,12 +81,13 @@ class SurroundRefiner:
         checked = (swept.evidence >= _LEAST_EVIDENCE) & ~torch.isnan(grid.depth)
         depth = torch.from_numpy(moment.depth).to(self._device)
         raw = raw_confidence(found.peak, found.log_ratio, swept.fineness)
+        share = checked_share(averaged(swept.contrast, _CONTRAST_SHARE))
 
         def on_picture(values: Tensor) -> Tensor:
             return enlarged(torch.where(checked, values, 0.0), grid.reduction)
 
         def confidence(raw: Tensor, mapped: ConfidenceMap) -> NDArray[np.float32]:
-            return _to_numpy(on_picture(mapped(raw)) * ~torch.isnan(depth))
+            return _to_numpy(on_picture(mapped(raw) * share) * ~torch.isnan(depth))
 
         return RefinedDepth(
             depth=_to_numpy(depth * on_picture(found.log_ratio).exp()),
