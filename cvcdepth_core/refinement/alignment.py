@@ -38,6 +38,7 @@ _LEAST_GRADIENT = 4.0  # grey levels per pixel
 _NEAREST, _FARTHEST = 0.5, 60.0  # metres
 _HUBER, _CUT = 6.0, 40.0  # grey levels
 _IN_FRONT = 0.1
+_LEAST_AGREEMENT = 0.5
 _CONVERGED = 1e-4  # metres and radians
 _PATCH = [(row, column) for row in (-1, 0, 1) for column in (-1, 0, 1)]
 
@@ -48,11 +49,13 @@ class AlignedMotion:
 
     twist: Twist
     covariance: NDArray[np.float64]
-    """[6, 6] of the twist, from the residuals."""
+    """[6, 6] of the twist, by the pictures' noise as the residuals tell it; an error of depth's scale is not in it."""
     cost: float
     """Mean robust cost of the patches' grey levels."""
     cost_before: float
     """The same for the best of the motions that the search began with."""
+    agreement: float
+    """Correlation of the patches with what the pictures before show of them; 1 is perfect."""
     cameras: int
     """That contributed enough points."""
     problem: str | None
@@ -83,9 +86,7 @@ class AlignedSet(NamedTuple):
         grid = to_grid(moment, max_width)
         times = moment.times_ns / 1e9
         mean = times[moment.present].mean() if moment.present.any() else 0.0
-        return cls(
-            grid.inner, grid.depth, grid.intrinsics, moment.base_T_camera, np.where(moment.present, times, mean)
-        )
+        return cls(grid.inner, grid.depth, grid.intrinsics, moment.base_T_camera, np.where(moment.present, times, mean))
 
 
 def align(previous: AlignedSet, current: AlignedSet, starts: Sequence[Twist] = ()) -> AlignedMotion:
@@ -162,7 +163,7 @@ class _Residuals(NamedTuple):
 
 
 def _textured_patches(current: AlignedSet, level: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Choose pixels of each camera evenly among those with texture and known depth; see `_Pair` for what is returned."""
+    """Choose pixels evenly among those with texture and known depth; return points, patches and known of `_Pair`."""
     grey, depth = reduced(current.grey, level), reduced_depth(current.depth, level)
     across, down = _gradients(grey)
     good = (torch.hypot(across, down) > _LEAST_GRADIENT) & (depth > _NEAREST) & (depth < _FARTHEST)
@@ -208,7 +209,7 @@ def _residuals(pair: _Pair, twist: Twist) -> _Residuals:
     a, b = x * nearness, y * nearness
     height, width = pair.pictures.shape[2:]
     grid = torch.stack([(fx * a + cx) * (2 / (width - 1)) - 1, (fy * b + cy) * (2 / (height - 1)) - 1], dim=-1)
-    grid = grid.unflatten(1, pair.patches.shape[1:])
+    grid = grid.view(*pair.patches.shape, 2)
     sampled = F.grid_sample(pair.pictures, grid, align_corners=True)
     inside = (grid.abs() <= 1).all(-1) & (z > _IN_FRONT).view_as(pair.patches) & ~torch.isnan(sampled).any(1)
     seen = pair.known & inside.all(2)
@@ -234,7 +235,8 @@ def _descended(pair: _Pair, twist: Twist) -> Twist:
 def _normal_equations(pair: _Pair, residuals: _Residuals) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return J^T W J [6, 6] and J^T W r [6] of the robust least squares, float64."""
     turning = torch.linalg.cross(residuals.points, residuals.slopes, dim=1)
-    jacobian = torch.cat([residuals.slopes, turning], dim=1).unflatten(2, pair.patches.shape[1:])
+    cameras, points, samples = pair.patches.shape
+    jacobian = torch.cat([residuals.slopes, turning], dim=1).view(cameras, 6, points, samples)
     jacobian = (jacobian - jacobian.mean(3, keepdim=True)) * pair.seconds.float()[:, None, None, None]
     magnitude = residuals.values.abs()
     weight = (_HUBER / magnitude.clamp(min=_HUBER)) * (magnitude < _CUT) * residuals.seen[..., None]
@@ -247,8 +249,7 @@ def _normal_equations(pair: _Pair, residuals: _Residuals) -> tuple[NDArray[np.fl
 def _solved(matrix: NDArray[np.float64], right: NDArray[np.float64]) -> Twist:
     """Solve, a little damped; what nothing determines stays as it is."""
     damping = 1e-6 * max(float(np.trace(matrix)), 1e-6) / 6
-    found: Twist = np.linalg.solve(matrix + damping * np.eye(6), right)
-    return found
+    return np.asarray(np.linalg.solve(matrix + damping * np.eye(6), right), np.float64)
 
 
 def _cost(pair: _Pair, twist: Twist) -> float:
@@ -263,21 +264,31 @@ def _cost(pair: _Pair, twist: Twist) -> float:
 def _result(pair: _Pair, twist: Twist, cost_before: float) -> AlignedMotion:
     residuals = _residuals(pair, twist)
     matrix, _ = _normal_equations(pair, residuals)
-    cost = _cost(pair, twist)
+    cost, agreement = _cost(pair, twist), _agreement(pair, residuals)
     cameras = int((residuals.seen.sum(1) >= _LEAST_POINTS).sum())
     damped = matrix + 1e-6 * np.eye(6) * max(float(np.trace(matrix)) / 6, 1e-6)
     # The nine grey levels of a patch are about three independent ones, and 2 cost their variance.
-    covariance: NDArray[np.float64] = np.linalg.inv(damped) * (6 * cost if math.isfinite(cost) else math.inf)
-    problem = _problem(cameras, len(pair.known), cost, cost_before)
-    return AlignedMotion(twist, covariance, cost, cost_before, cameras, problem)
+    variance = np.linalg.inv(damped) * 6 * cost if math.isfinite(cost) else np.diag(np.full(6, math.inf))
+    covariance = np.asarray(variance, np.float64)
+    problem = _problem(cameras, min(_LEAST_CAMERAS, len(pair.known)), agreement)
+    if problem is None and cost > cost_before:
+        problem = f"pictures agree no better than before: cost {cost:.2f} against {cost_before:.2f}"
+    return AlignedMotion(twist, covariance, cost, cost_before, agreement, cameras, problem)
 
 
-def _problem(cameras: int, of_cameras: int, cost: float, cost_before: float) -> str | None:
-    least = min(_LEAST_CAMERAS, of_cameras)
+def _agreement(pair: _Pair, residuals: _Residuals) -> float:
+    """Return the correlation of all patches' grey levels with those before, each around its mean; 0 for none."""
+    now = pair.patches[residuals.seen]
+    before = residuals.values[residuals.seen] + now
+    norm = float(now.norm() * before.norm())
+    return float((now * before).sum()) / norm if norm > 0 else 0.0
+
+
+def _problem(cameras: int, least: int, agreement: float) -> str | None:
     if cameras < least:
         return f"only {cameras} cameras see enough texture with known depth, {least} are needed"
-    if cost > cost_before:
-        return f"pictures agree no better than before: cost {cost:.2f} against {cost_before:.2f}"
+    if agreement < _LEAST_AGREEMENT:
+        return f"the pictures do not agree: correlation {agreement:.2f}, {_LEAST_AGREEMENT} is needed"
     return None
 
 
@@ -294,4 +305,4 @@ def _skew(vectors: Tensor) -> Tensor:
     """Return the matrices [..., 3, 3] of the cross products with `vectors` [..., 3]."""
     x, y, z = vectors.unbind(-1)
     zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).view(*x.shape, 3, 3)

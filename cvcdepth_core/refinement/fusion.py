@@ -72,7 +72,7 @@ def _scan(lines: Tensor, step_penalty: float) -> Tensor:
 
 
 def averaged(values: Tensor, share: float) -> Tensor:
-    """Average `values` [N, ..., h, w] over squares whose edge is about `share` of the width, an odd number of pixels."""
+    """Average `values` [N, ..., h, w] over squares of an odd number of pixels, about `share` of the width, squared."""
     half = round((share * values.shape[-1] - 1) / 2)
     if half < 1:
         return values

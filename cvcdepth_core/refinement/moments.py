@@ -48,8 +48,8 @@ class SurroundMoment:
             )
 
     @property
-    def world_T_camera(self) -> NDArray[np.float64]:
-        """[N, 4, 4] the cameras' poses at their exposures; in the base frame where the motion is not known."""
+    def camera_poses(self) -> NDArray[np.float64]:
+        """world_T_camera [N, 4, 4] at each exposure; in the base frame where the motion is not known."""
         return self.base_T_camera if self.world_T_base is None else self.world_T_base @ self.base_T_camera
 
     def with_depth(self, depth: NDArray[np.float32]) -> SurroundMoment:
@@ -103,7 +103,7 @@ def to_grid(moment: SurroundMoment, max_width: int, device: torch.device | str =
         grey=F.pad(reduced(levels, reduction), (1, 1, 1, 1), value=torch.nan),
         depth=reduced_depth(torch.from_numpy(moment.depth).to(device), reduction),
         intrinsics=np.stack([scale_intrinsics(K, scale) for K in moment.intrinsics]),
-        world_T_camera=moment.world_T_camera,
+        world_T_camera=moment.camera_poses,
         reduction=reduction,
     )
 

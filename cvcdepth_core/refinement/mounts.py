@@ -39,6 +39,7 @@ _OUTSIDE = 8  # pixels that a patch may lie outside of the other picture, which 
 _FARTHEST_TURN, _COARSE_STEP, _FINEST_STEP = 1.5, 0.3, 0.02  # degrees
 _CURVATURE_STEP = 0.15
 _LEAST_SCORE = 0.3
+_UNSEEN = -1.0  # the least that a correlation can be
 _LEAST_INFORMATION = 400.0  # per square degree: patches times the bend of their correlation
 _CONTRADICTION = 0.3  # degrees
 
@@ -54,7 +55,7 @@ class PairTurn(NamedTuple):
     """[3, 3] per square degree: how sharply the pictures tell it."""
     patches: int
     before: float
-    """Mean ZNCC of the patches as mounted."""
+    """Mean ZNCC of the patches as mounted; NaN where too few are seen."""
     after: float
     """The same after the turn."""
     problem: str | None
@@ -109,7 +110,7 @@ class MountSearch:
 
 
 def consistent_mounts(base_T_camera: NDArray[np.float64], anchor: int, pairs: Iterable[PairTurn]) -> RefinedMounts:
-    """Find the cameras' corrections that fit all pairs best; pairs that contradict the others are left out, worst first."""
+    """Find the corrections that fit all pairs best; pairs that contradict the others are left out, worst first."""
     judged = list(pairs)
     while True:
         turns = _corrections(base_T_camera, anchor, [pair for pair in judged if pair.problem is None])
@@ -118,9 +119,9 @@ def consistent_mounts(base_T_camera: NDArray[np.float64], anchor: int, pairs: It
         if not judged or misfits[worst] <= _CONTRADICTION:
             break
         both = {judged[worst].camera, judged[worst].neighbour}
-        problem = f"contradicts the other pairs, or itself the other way round, by {misfits[worst]:.2f} degrees"
+        reason = f"contradicts the other pairs, or itself the other way round, by {misfits[worst]:.2f} degrees"
         judged = [
-            pair._replace(problem=pair.problem or problem) if {pair.camera, pair.neighbour} == both else pair
+            pair._replace(problem=pair.problem or reason) if {pair.camera, pair.neighbour} == both else pair
             for pair in judged
         ]
     corrected = base_T_camera.copy()
@@ -192,44 +193,49 @@ def _nearly_inside(points: Tensor, intrinsics: Tensor, size: torch.Size) -> Tens
     pixels = homogeneous[..., :2] / homogeneous[..., 2:]
     largest = pixels.new_tensor([size[1] - 1, size[0] - 1])
     inside = (pixels > -_OUTSIDE) & (pixels < largest + _OUTSIDE) & (homogeneous[..., 2:] > _NEAREST)
-    return inside.all(-1).all(-1)
+    whole: Tensor = inside.all(-1).all(-1)
+    return whole
 
 
 def _normalised(patches: Tensor) -> Tensor:
     """Return patches [..., 16] around their mean, scaled to length 1, flat ones to less."""
-    centred = patches - patches.mean(-1, keepdim=True)
+    centred: Tensor = patches - patches.mean(-1, keepdim=True)
     least = _NOISE * math.sqrt(len(_OFFSETS))
     return centred / centred.norm(dim=-1, keepdim=True).clamp(min=least)
 
 
 def _pair_turn(camera: int, neighbour: int, patches: Sequence[_Patches]) -> PairTurn:
     count = sum(len(part.points) for part in patches)
-    nothing = np.zeros((3, 3))
     if count < _LEAST_PATCHES:
         problem = f"{count} textured patches of known depth in the overlap, {_LEAST_PATCHES} are needed"
-        return PairTurn(camera, neighbour, np.zeros(3), nothing, count, math.nan, math.nan, problem)
+        return PairTurn(camera, neighbour, np.zeros(3), np.zeros((3, 3)), count, math.nan, math.nan, problem)
     turn = _best_turn(patches)
-    before, after = _mean_scores(patches, np.stack([np.zeros(3), turn])).tolist()
+    before, after = (_known(score) for score in _mean_scores(patches, np.stack([np.zeros(3), turn])).tolist())
     information = count * _curvature(patches, turn)[0]
-    problem = _pair_problem(before, after, information)
-    return PairTurn(camera, neighbour, turn, information, count, before, after, problem)
+    return PairTurn(
+        camera, neighbour, turn, information, count, before, after, _pair_problem(before, after, information)
+    )
 
 
 def _pair_problem(before: float, after: float, information: NDArray[np.float64]) -> str | None:
-    if before < -0.5:
+    if math.isnan(before):
         return f"fewer than {_LEAST_PATCHES // 2} textured patches lie in the overlap as mounted"
-    if after < _LEAST_SCORE:
+    if not after >= _LEAST_SCORE:
         return f"the pictures correlate by {after:.2f} at best, {_LEAST_SCORE} are needed"
     if np.linalg.eigvalsh(information)[1] < _LEAST_INFORMATION:
         return "the overlap's texture does not tell where the neighbour looks"
     return None
 
 
+def _known(score: float) -> float:
+    return math.nan if score == _UNSEEN else score
+
+
 def _mean_scores(patches: Sequence[_Patches], turns: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean ZNCC [T] after each of `turns` [T, 3]; -1 where too few patches are seen to tell."""
+    """Return the mean ZNCC [T] after each of `turns` [T, 3]; `_UNSEEN` where too few patches are seen to tell."""
     found = [part.scores(torch.from_numpy(turns)) for part in patches if len(part.points)]
     total, seen = (torch.stack(parts).sum(0).double().numpy() for parts in zip(*found, strict=True))
-    return np.where(seen >= _LEAST_PATCHES / 2, total / np.maximum(seen, 1), -1.0)
+    return np.where(seen >= _LEAST_PATCHES / 2, total / np.maximum(seen, 1), _UNSEEN)
 
 
 def _best_turn(patches: Sequence[_Patches]) -> Turn:
@@ -263,9 +269,7 @@ def _curvature(patches: Sequence[_Patches], turn: Turn) -> tuple[NDArray[np.floa
     return vectors @ np.diag(values.clip(min=0)) @ vectors.T, (plus - minus) / (2 * _CURVATURE_STEP)
 
 
-def _corrections(
-    base_T_camera: NDArray[np.float64], anchor: int, pairs: Sequence[PairTurn]
-) -> NDArray[np.float64]:
+def _corrections(base_T_camera: NDArray[np.float64], anchor: int, pairs: Sequence[PairTurn]) -> NDArray[np.float64]:
     """Return the turns [N, 3] of least squares; NaN for cameras that no chain of pairs connects with the anchor."""
     cameras = len(base_T_camera)
     normal, right = np.zeros((3 * cameras, 3 * cameras)), np.zeros(3 * cameras)

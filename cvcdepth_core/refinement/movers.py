@@ -37,5 +37,7 @@ def _angles(way: NDArray[np.float64], intrinsics: NDArray[np.float64], size: tup
     height, width = size
     a = np.linalg.inv(intrinsics)
     u, v = torch.arange(width, dtype=torch.float32)[None], torch.arange(height, dtype=torch.float32)[:, None]
-    x, y, z, along = (row[0] * u + row[1] * v + row[2] for row in [*a.tolist(), (way / np.linalg.norm(way) @ a).tolist()])
-    return (along.abs() / (x.square() + y.square() + z.square()).sqrt()).clamp_(max=1.0).acos_()
+    rows = [*a.tolist(), (way / np.linalg.norm(way) @ a).tolist()]
+    x, y, z, along = (row[0] * u + row[1] * v + row[2] for row in rows)
+    cosine: Tensor = along.abs() / (x.square() + y.square() + z.square()).sqrt()
+    return cosine.clamp_(max=1.0).acos_()

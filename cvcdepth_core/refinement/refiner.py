@@ -132,8 +132,8 @@ def _view(grid: GridSet, camera: int) -> View:
 
 def _way(view: View, earlier: View) -> NDArray[np.float64]:
     """Return how the camera moved since the earlier picture, [3] metres in its own frame."""
-    moved: NDArray[np.float64] = view.world_T_camera[:3, 3] - earlier.world_T_camera[:3, 3]
-    return view.world_T_camera[:3, :3].T @ moved
+    moved = view.world_T_camera[:3, 3] - earlier.world_T_camera[:3, 3]
+    return np.asarray(view.world_T_camera[:3, :3].T @ moved)
 
 
 def _to_numpy(values: Tensor) -> NDArray[np.float32]:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the geometric refinement looks for, and how closely.
 
-The sweep's numbers were chosen on sets 14 to 29 of the sample recording, whose depth was spoilt by smooth random factors
-first, because the default model knows those sets by heart; none was chosen on the held-out quarter.
+The sweep's numbers were chosen on sets 14 to 29 of the sample recording, whose depth was spoilt by smooth random
+factors before, because the default model knows those sets by heart; none was chosen on the held-out quarter.
 """
 
 from __future__ import annotations

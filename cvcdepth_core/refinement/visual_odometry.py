@@ -61,8 +61,8 @@ class VisualOdometry:
         self._now = now, here if motion.problem is None else np.eye(4), motion
         return motion
 
-    def world_T_base(self) -> NDArray[np.float64] | None:
-        """Return the vehicle's pose [N, 4, 4] at each exposure of the set last tracked; None while it is not known."""
+    def base_poses(self) -> NDArray[np.float64] | None:
+        """Return world_T_base [N, 4, 4] at each exposure of the set last tracked; None while it is not known."""
         if self._now is None:
             return None
         now, here, motion = self._now
@@ -72,7 +72,7 @@ class VisualOdometry:
         return np.stack([here @ motion.pose(float(time) - reference) for time in now.times])
 
     def keep(self, depth: NDArray[np.float32]) -> None:
-        """Let the next set align to the one last tracked, with this `depth` [N, H, W] (metres, NaN where not trusted)."""
+        """Let the next set align to the one last tracked, with this `depth` [N, H, W] (NaN where not trusted)."""
         if self._now is None:
             return
         now, here, motion = self._now

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How good confidence is: does it rank errors (sparsification), and does it say how often depth is right (calibration).
+"""How good confidence is: does it rank errors (sparsification), does it say how often depth is right (calibration).
 
-Sparsification removes the least certain pixels first and looks at the mean error of the rest (Ilg et al., 2018). AUSE is
-the area between that curve and the one of an oracle that removes the largest errors first; AURG is the area that is won
-over removal at random. Both are divided by the error of all pixels: 0 would be the oracle's AUSE.
+Sparsification removes the least certain pixels first and looks at the mean error of the rest (Ilg et al., 2018). AUSE
+is the area between that curve and the one of an oracle that removes the largest errors first; AURG is the area that is
+won over removal at random. Both are divided by the error of all pixels: 0 would be the oracle's AUSE.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ class CalibrationTable:
         step = np.minimum(log_error / _LARGEST_ERROR * _ERROR_BINS, _ERROR_BINS).astype(np.int64)
         errors = np.bincount(of_class * (_ERROR_BINS + 1) + step, minlength=_CLASSES * (_ERROR_BINS + 1))
         return cls(
-            np.bincount(of_class, weights=samples.confidence, minlength=_CLASSES),
+            np.bincount(of_class, weights=samples.confidence, minlength=_CLASSES).astype(np.float64),
             np.bincount(of_class[log_error < _RIGHT_WITHIN], minlength=_CLASSES),
             errors.reshape(_CLASSES, _ERROR_BINS + 1),
         )

@@ -80,8 +80,8 @@ def render(
         hit = (distance > 0) & (distance < depth) & (np.abs(y) <= surface.half_y) & (np.abs(z) <= surface.half_z)
         slant = np.abs(local_rays[..., 0]) / np.linalg.norm(local_rays, axis=-1)
         footprint = distance / intrinsics[0, 0] / np.sqrt(np.maximum(slant, 1e-3))
-        seen = surface.grey(np.where(hit, y, 0.0), np.where(hit, z, 0.0), np.where(hit, footprint, 0.0))
-        depth, grey = np.where(hit, distance, depth), np.where(hit, seen, grey)
+        depth[hit] = distance[hit]
+        grey[hit] = surface.grey(y[hit], z[hit], footprint[hit])
     picture = np.rint(np.clip(grey, 0, 255)).astype(np.uint8)
     return np.repeat(picture[..., None], 3, axis=-1), np.where(np.isfinite(depth), depth, np.nan).astype(np.float32)
 

@@ -23,7 +23,9 @@ def wall(distance: float, yaw: float = 0.0) -> list[Rectangle]:
 def view(surfaces: list[Rectangle], world_T_camera: np.ndarray) -> tuple[View, torch.Tensor]:
     picture, depth = render(surfaces, world_T_camera, K, SIZE)
     grey = torch.from_numpy(picture[..., 0].astype(np.float32) - 128)
-    return View(torch.nn.functional.pad(grey, (1, 1, 1, 1), value=torch.nan), K, world_T_camera), torch.from_numpy(depth)
+    return View(torch.nn.functional.pad(grey, (1, 1, 1, 1), value=torch.nan), K, world_T_camera), torch.from_numpy(
+        depth
+    )
 
 
 def swept(surfaces: list[Rectangle], own: np.ndarray, others: list[np.ndarray], ratio: float = 0.0):
@@ -33,7 +35,7 @@ def swept(surfaces: list[Rectangle], own: np.ndarray, others: list[np.ndarray], 
 
 
 def share_at(found, ratio: float, least_radius: float = 0.0) -> float:
-    """Share of the pixels with parallax, so far from the picture's middle, whose least cost is at the right hypothesis."""
+    """Share of the pixels with parallax, so far from the middle, whose least cost is at the right hypothesis."""
     best = LOG_RATIOS[found.cost.argmin(0)]
     v, u = torch.meshgrid(*(torch.arange(size) - size / 2 for size in SIZE), indexing="ij")
     judged = (found.evidence > 0.9) & (found.cost.amin(0) < 0.5) & (torch.hypot(u, v) >= least_radius)
@@ -71,7 +73,9 @@ def test_patches_follow_the_slope_of_the_prior():
 
 
 @pytest.mark.parametrize(
-    "source", [looking(yaw=180), looking(yaw=90), looking(x=20.0), looking(y=60.0)], ids=["behind", "aside", "past", "far"]
+    "source",
+    [looking(yaw=180), looking(yaw=90), looking(x=20.0), looking(y=60.0)],
+    ids=["behind", "aside", "past", "far"],
 )
 def test_a_source_that_sees_nothing_of_the_view_says_nothing(source: np.ndarray):
     seen, depth = view(wall(6.0), looking())

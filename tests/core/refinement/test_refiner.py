@@ -2,6 +2,7 @@
 """Refined depth against exact truth, and what must leave the prior as it is, bit for bit."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ WALL = [Rectangle(pose(x=6.0), seed=3, wavelengths=(0.3, 2.4))]
 GREY_WALL = [Rectangle(pose(x=6.0), contrast=0.0)]
 
 
-def driven(drive: Drive, times: list[float], prior: float = 1.0, neighbours=(), **settings) -> RefinedDepth:
+def driven(drive: Drive, times: list[float], prior: float = 1.0, neighbours=(), **settings: Any) -> RefinedDepth:
     """What becomes of the last of the sets at these times, seconds."""
     refiner = SurroundRefiner(neighbours, RefinementSettings(**settings))
     return [refiner.refine(drive.moment(time, prior)) for time in times][-1]
@@ -176,7 +177,9 @@ def test_a_vehicle_ahead_is_not_pushed_to_the_horizon():
     refined = driven(drive, [0.0, 0.2, 0.4, 0.6, 0.8])
     moment = drive.moment(0.8)
     on_car = moment.depth < 9.0
-    assert np.median(refined.depth[on_car] / moment.depth[on_car]) < 1.45  # without the guard: 2.2, the farthest there is
+    assert (
+        np.median(refined.depth[on_car] / moment.depth[on_car]) < 1.45
+    )  # without the guard: 2.2, the farthest there is
 
 
 def test_mirrored_pictures_give_mirrored_depth():
@@ -251,7 +254,8 @@ def test_a_finer_grid_tells_more_exactly():
     drive = Drive(street(), ONE, straight((3.0, 4.0, 0.0)))
     truth = drive.moment(0.3).depth
     coarse, fine = (
-        errors(driven(drive, [0.0, 0.1, 0.2, 0.3], 1.3, max_grid_width=width).depth, truth).mean() for width in (80, 160)
+        errors(driven(drive, [0.0, 0.1, 0.2, 0.3], 1.3, max_grid_width=width).depth, truth).mean()
+        for width in (80, 160)
     )
     assert fine < 0.9 * coarse < 0.15
 
