@@ -201,7 +201,8 @@ def _normalised(patches: Tensor) -> Tensor:
     """Return patches [..., 16] around their mean, scaled to length 1, flat ones to less."""
     centred: Tensor = patches - patches.mean(-1, keepdim=True)
     least = _NOISE * math.sqrt(len(_OFFSETS))
-    return centred / centred.norm(dim=-1, keepdim=True).clamp(min=least)
+    normalised: Tensor = centred / centred.norm(dim=-1, keepdim=True).clamp(min=least)
+    return normalised
 
 
 def _pair_turn(camera: int, neighbour: int, patches: Sequence[_Patches]) -> PairTurn:
