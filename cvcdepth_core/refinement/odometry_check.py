@@ -119,7 +119,7 @@ def _lag(times: NDArray[np.float64], seen: NDArray[np.float64], recorded: NDArra
             shifted = np.stack([np.interp(times[inner] + shift, times, theirs) for shift in shifts])
             misfits += _unlikeness(mine[inner], shifted)
     best, none = int(misfits.argmin()), int(np.abs(shifts).argmin())
-    if abs(shifts[best]) < _LEAST_LAG or misfits[best] > (1 - _LAG_GAIN) * misfits[none]:
+    if not misfits.any() or abs(shifts[best]) < _LEAST_LAG or misfits[best] > (1 - _LAG_GAIN) * misfits[none]:
         return None
     verb = "lags behind" if shifts[best] > 0 else "is ahead of"
     return f"odometry {verb} the pictures by {abs(shifts[best]):.2f} s"
