@@ -9,11 +9,14 @@ from solid_world import Rectangle, pose, street
 from surround_drive import Drive, Way, ring, straight
 
 from cvcdepth_core.refinement.alignment import AlignedMotion, AlignedSet, align, exponential, logarithm
+from cvcdepth_core.refinement.refiner import SurroundRefiner
 from cvcdepth_core.refinement.visual_odometry import VisualOdometry
+from cvcdepth_core.refinement.without_odometry import RefinerWithoutOdometry
 from cvcdepth_core.rig.poses import inverse
 
 MOUNTS = ring(4, 75)
 STREET = street()
+BUMPS = np.exp(0.3 * np.sin(np.arange(160) / 12.0))[None, None].astype(np.float32)
 TURNING = straight((5.0, 0.0, 0.0), yaw_rate=8.0)
 
 
@@ -144,3 +147,19 @@ def test_a_dead_camera_does_not_stop_odometry():
         odometry.keep(moment.depth)
     assert motion.cameras == 3
     assert misses(motion, TURNING)[0] < 0.02
+
+
+def test_without_odometry_depth_becomes_as_good_as_the_scale_that_it_began_with():
+    drive = Drive(STREET, MOUNTS, TURNING)
+    refiner = RefinerWithoutOdometry(SurroundRefiner([]), VisualOdometry())
+    for number in range(5):
+        moment = drive.moment(0.1 * number)
+        bent = moment.with_depth(moment.depth * BUMPS)
+        refined = refiner.refine(bent)
+    truth = moment.depth
+    before, after = (np.nanmedian(np.abs(found - truth) / truth) for found in (bent.depth, refined.depth))
+    assert after < 0.5 * before
+    assert refiner.motion.problem is None
+    assert misses(refiner.motion, TURNING)[0] < 0.1
+    refiner.reset()
+    assert not refiner.refine(moment).confidence.any()
