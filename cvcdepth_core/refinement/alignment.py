@@ -21,7 +21,7 @@ from torch.nn import functional as F  # noqa: N812 - the field's name for it
 
 from cvcdepth_core.refinement.moments import SurroundMoment, reduced, reduced_depth, to_grid
 from cvcdepth_core.rendering.projection import transform
-from cvcdepth_core.rig.calibration import scale_intrinsics
+from cvcdepth_core.rig.pinhole import scale_intrinsics
 from cvcdepth_core.rig.poses import Pose, inverse
 
 Twist = NDArray[np.float64]

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional as F  # noqa: N812 - the field's name for it
 
 from cvcdepth_core.errors import ImageError
-from cvcdepth_core.rig.calibration import scale_intrinsics
+from cvcdepth_core.rig.pinhole import scale_intrinsics
 
 MIDDLE_GREY = 128.0
 

@@ -15,7 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cvcdepth_core.scoring.ground_truth import SparseDepth, sample_prediction
+from cvcdepth_core.scoring.ground_truth import sample_prediction
+from cvcdepth_core.scoring.sparse_depth import SparseDepth
 
 _STEPS = 100
 _RIGHT_WITHIN = math.log(1.25)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cvcdepth_core.scoring.confidence import CalibrationTable, ConfidenceSamples, confidence_samples, sparsification
-from cvcdepth_core.scoring.ground_truth import SparseDepth
+from cvcdepth_core.scoring.sparse_depth import SparseDepth
 
 RANDOM = np.random.default_rng(2)
 TRUTH = RANDOM.uniform(2.0, 50.0, 4000)
