@@ -49,6 +49,7 @@ CORE_ROOMS = {
     "pointcloud": f"{_GROUND} rig",
     "visualization": f"{_GROUND} rig images",
     "worlds": f"{_GROUND} rig",
+    "refinement": f"{_GROUND} rig images rendering",
 }
 ROS_ROOMS = {
     "installation": "",
