@@ -22,6 +22,7 @@ from cvcdepth_ros.commands import (
     run,
     simulate,
 )
+from cvcdepth_ros.console import styled
 from cvcdepth_ros.installation import package_version
 
 PROGRAM = "cvcdepth"
@@ -111,7 +112,7 @@ def _texts(program: str, description: str, examples: Sequence[str]) -> dict[str,
 
 
 def _fail(program: str, reason: str, code: int = 1) -> int:
-    print(f"{program}: {' '.join(reason.split())}", file=sys.stderr)
+    print(f"{styled(f'{program}:', 'red', sys.stderr)} {' '.join(reason.split())}", file=sys.stderr)
     return code
 
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The installation that is running: its version, and where its configuration, rigs and launch files lie."""
 
+from importlib.util import find_spec
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -12,6 +13,19 @@ PACKAGE = "cvcdepth_ros"
 def package_version() -> str:
     """Return the version that package.xml states; ConfigError when the package's files are not installed."""
     return ElementTree.parse(share_directory() / "package.xml").findtext("version", default="unknown")
+
+
+def require_ros(what: str) -> None:
+    """Raise ConfigError, with the remedy, where rclpy is not installed; `what` needs it."""
+    try:
+        is_installed = find_spec("rclpy") is not None
+    except ValueError:  # somebody has put None into sys.modules
+        is_installed = False
+    if not is_installed:
+        raise ConfigError(
+            f"{what} needs ROS 2, but rclpy is not installed here: source a ROS 2 installation, or "
+            "`pip install 'cvcdepth_ros[ros-jazzy]'`"
+        )
 
 
 def share_directory() -> Path:

@@ -20,6 +20,12 @@ if TYPE_CHECKING:
 LIDAR_TOLERANCE = 0.1
 """Seconds that a LiDAR sweep may be from the image that it is the truth of, unless something else is asked for."""
 
+AUTO = "auto"
+"""Name of the rig that the node finds among the live topics."""
+
+CHANGEABLE_WHILE_RUNNING = ("checkpoint", "cloud_stride", "cloud_min_range", "cloud_max_range", "cloud_voxel")
+"""Parameters of the node that need not wait until it is cleaned up."""
+
 _SMALLEST_VOXEL = 0.01
 _UNTRAINED_DEPTHS = (1.5, 200.0)  # metres: least and greatest depth of a network with random weights
 
@@ -130,3 +136,40 @@ class OutputSettings(Settings):
         from cvcdepth_core.pointcloud import CloudLimits
 
         return CloudLimits(self.cloud_stride, self.cloud_min_range, self.cloud_max_range, self.cloud_voxel)
+
+
+class NodeParameters(OutputSettings, MissingCameraSettings, MatchingSettings, ModelSettings):
+    """Everything that can be set for the node; the docstring of each field is its ROS description."""
+
+    rig: str = AUTO
+    """Rig file (YAML), or 'auto': find the cameras among the live topics and their poses on /tf_static."""
+    base_frame: str = "base_link"
+    """With rig 'auto': the vehicle's frame. A rig file names its own."""
+    autostart: bool = True
+    """Configure and activate at start; switch off where a lifecycle manager does that."""
+    max_age: float = Field(0.5, ge=0, le=3600)
+    """Seconds (ROS time) after which a waiting set is not worth inference any more; 0 takes any age."""
+    max_image_mb: float = Field(64.0, gt=0, le=2000)
+    """Megabytes above which an image message is refused; queue_size such images are kept per camera at most."""
+    reliable: bool = False
+    """Subscribe images and camera_info reliably instead of with sensor-data QoS."""
+    stale_after: float = Field(1.0, gt=0, le=3600)
+    """Seconds without an image after which a camera counts as stale."""
+    frozen_after: float = Field(1.0, ge=0, le=3600)
+    """Seconds of the very same picture after which a camera counts as frozen and is left out; 0 accepts any."""
+    overlap_monitor: bool = True
+    """Compare neighbouring cameras in their overlaps, to tell of a shifted mount or a dirty lens in /diagnostics."""
+    publish_tf: bool = True
+    """Publish the camera poses of a rig file on /tf_static, but for frames that TF has already."""
+    trace: str = ""
+    """File for a trace of every stage that https://ui.perfetto.dev opens; at most 64 MB."""
+
+    def check_complete(self) -> None:
+        """Raise ConfigError where the parameters are each possible but together not enough to start with."""
+        if not self.rig:
+            raise ConfigError(f"parameter rig is empty: name a rig file, or '{AUTO}'")
+        if self.untrained and self.checkpoint:
+            raise ConfigError(
+                f"parameters checkpoint '{self.checkpoint}' and untrained true: a checkpoint is trained; name none "
+                "to run random weights"
+            )

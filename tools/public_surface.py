@@ -210,7 +210,7 @@ def node() -> Sections:
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     import rclpy
 
-    from cvcdepth_ros.surround_depth_node import SurroundDepthNode
+    from cvcdepth_ros.node.surround_node import SurroundDepthNode
 
     rclpy.init()
     try:

@@ -49,6 +49,7 @@ CORE_ROOMS = {
     "pointcloud": f"{_GROUND} rig",
     "visualization": f"{_GROUND} rig images",
     "worlds": f"{_GROUND} rig",
+    "refinement": f"{_GROUND} rig images rendering",
 }
 ROS_ROOMS = {
     "installation": "",
@@ -73,8 +74,8 @@ ROS_ROOMS = {
     "commands": "installation settings console bags kept messages surround_sets recordings live checks training_data "
     "evaluation node simulation finetuning end_to_end bench reports",
     "demo": "installation settings console bags messages surround_sets recordings end_to_end reports",
-    "bag_replay": "installation commands",
-    "surround_depth_node": "messages live node",
+    "bag_replay": "installation console commands",
+    "surround_depth_node": "settings live node",
 }
 
 
@@ -93,11 +94,10 @@ HOUSE = House(
     {"cvcdepth_core": CORE_ROOMS, "cvcdepth_ros": ROS_ROOMS},
     (
         "cvcdepth_ros.node.*",
-        "cvcdepth_ros.surround_depth_node",
         "cvcdepth_ros.bench.*_node",
         "cvcdepth_ros.end_to_end.recorder",
     ),
-    ("cvcdepth_ros.commands.play",),
+    ("cvcdepth_ros.commands.play", "cvcdepth_ros.surround_depth_node"),
 )
 
 

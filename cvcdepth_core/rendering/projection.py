@@ -6,6 +6,8 @@ Pixel centres are the integers, u to the right and v down; poses are named `targ
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor, nn
 
@@ -88,10 +90,13 @@ def unit_depth_points(inverse_intrinsics: Tensor, height: int, width: int) -> Te
 
     `inverse_intrinsics` [..., 3, 3] belongs to an image of `height` x `width` pixels.
     """
-    ones = inverse_intrinsics.new_ones(height, width)
-    v, u = ones.cumsum(0) - 1, ones.cumsum(1) - 1
-    pixels = torch.stack([u, v, ones]).flatten(1)
-    return inverse_intrinsics @ pixels
+    return inverse_intrinsics @ pixel_grid(inverse_intrinsics.new_empty(height, width))
+
+
+def pixel_grid(like: Tensor) -> Tensor:
+    """Return the homogeneous pixels (u, v, 1) [3, H*W] of an image of the size of `like` [..., H, W], row by row."""
+    ones = like.new_ones(like.shape[-2:])
+    return torch.stack([ones.cumsum(1) - 1, ones.cumsum(0) - 1, ones]).flatten(1)
 
 
 def back_project(depth: Tensor, inverse_intrinsics: Tensor) -> Tensor:
@@ -112,6 +117,40 @@ def project(points: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
     """
     homogeneous = intrinsics @ points
     z = homogeneous[..., 2:, :]
+    return homogeneous[..., :2, :] / divisor(z), z
+
+
+def divisor(z: Tensor) -> Tensor:
+    """Return what homogeneous pixels are divided by, never zero (method section 5)."""
     denominator = z + PROJECTION_EPSILON
-    denominator = torch.where(denominator.abs() < _LEAST_DENOMINATOR, _LEAST_DENOMINATOR, denominator)
-    return homogeneous[..., :2, :] / denominator, z
+    return torch.where(denominator.abs() < _LEAST_DENOMINATOR, _LEAST_DENOMINATOR, denominator)
+
+
+class Reprojection(NamedTuple):
+    """The way from the pixels of one image, with their depths, to the pixels of another."""
+
+    turn: Tensor
+    """[..., 3, 3] K_source R inv(K_target)."""
+    shift: Tensor
+    """[..., 3, 1] K_source t."""
+
+    @classmethod
+    def from_cameras(cls, inverse_intrinsics: Tensor, source_T_target: Tensor, intrinsics: Tensor) -> Reprojection:
+        """Take the target's inverse intrinsics [..., 3, 3], the pose [..., 4, 4], and the source's intrinsics."""
+        projection = intrinsics @ source_T_target[..., :3, :]
+        return cls(projection[..., :3] @ inverse_intrinsics, projection[..., 3:])
+
+    def from_column(self, first: Tensor) -> Reprojection:
+        """Return the same for a part of the target image that begins at column `first` [...]."""
+        turn = self.turn.clone()
+        turn[..., 2] += turn[..., 0] * first[..., None]
+        return self._replace(turn=turn)
+
+    def turned(self, like: Tensor) -> Tensor:
+        """Return where the pixels of an image of the size of `like` [..., H, W] were at infinity, [..., 3, H*W]."""
+        return self.turn @ pixel_grid(like)
+
+    def z(self, depth: Tensor) -> Tensor:
+        """Return the source's z [..., 1, H, W] of pixels at `depth` [..., 1, H, W], metres both."""
+        along_axis = Reprojection(self.turn[..., 2:, :], self.shift[..., 2:, :])
+        return torch.addcmul(along_axis.shift, along_axis.turned(depth), depth.flatten(-2)).view_as(depth)

@@ -8,15 +8,18 @@ is rendered from which is a matter of index tensors, so there is no loop over ca
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 from torch.nn import functional as F  # noqa: N812 - the field's name for it
 
-from cvcdepth_core.rendering.projection import project, transform
+from cvcdepth_core.rendering.projection import Reprojection, divisor, pixel_grid, project, transform
 
 _OUTSIDE = 2.0
 _STD_EPSILON = 1e-8
+_OVER_VIEW = (-3, -2, -1)
 
 
 @dataclass(frozen=True)
@@ -48,10 +51,71 @@ def warp_views(
 
     """
     grid, z = sampling_grid(transform(source_T_target, points), intrinsics, images.shape[-2:])
-    seen = (grid.detach().abs() <= 1.0).all(dim=-1).unsqueeze(-3)
+    return _rendered(grid, z, images, masks, in_front_only)
+
+
+def warp_by_depth(
+    depth: Tensor, images: Tensor, masks: Tensor, source_of_target: Reprojection, in_front_only: bool
+) -> Warp:
+    """Render target views, or parts of them, by their `depth` [..., 1, H, w] in metres.
+
+    The quicker form of `warp_views`, with no points in between: the leading dimensions, `images`, `masks` and
+    `in_front_only` are as there. `source_of_target` leads from the pixels of `depth` to those of the source.
+    """
+    grid, z = _GridByDepth.apply(depth, *source_of_target, images.shape[-2:])  # type: ignore[no-untyped-call]
+    return _rendered(grid, z, images, masks, in_front_only)
+
+
+class _GridByDepth(torch.autograd.Function):
+    """The sampling grid of `warp_by_depth`, with a gradient of its own that keeps few of the images in between."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, depth: Tensor, turn: Tensor, shift: Tensor, size: tuple[int, int] | torch.Size
+    ) -> tuple[Tensor, Tensor]:
+        turned = Reprojection(turn, shift).turned(depth)
+        x, y, z = torch.addcmul(shift, turned, depth.flatten(-2)).unbind(-2)
+        nearness = divisor(z).reciprocal_()
+        u, v = ((along * nearness).mul_(scale).sub_(1.0) for along, scale in zip((x, y), _scales(size), strict=True))
+        grid = torch.view_as_real(torch.complex(u, v)).view(*u.shape[:-1], *depth.shape[-2:], 2)
+        ctx.save_for_backward(depth, turn, shift, nearness, grid)
+        ctx.size = size
+        ctx.mark_non_differentiable(z)
+        return grid, z
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_grid: Tensor, _: Tensor) -> tuple[Tensor, Tensor, Tensor, None]:
+        depth, turn, shift, nearness, grid = ctx.saved_tensors
+        u, v = grid.flatten(-3, -2).unbind(-1)
+        by_u, by_v = (part * nearness for part in grad_grid.flatten(-3, -2).unbind(-1))
+        # u + 1 is proportional to x / z.
+        by_z = torch.addcmul(by_u, by_u, u).add_(by_v).addcmul_(by_v, v).neg_()
+        across, down = _scales(ctx.size)
+        by_pixel = torch.stack([by_u.mul_(across), by_v.mul_(down), by_z], dim=-2)
+        grad_depth = (by_pixel * Reprojection(turn, shift).turned(depth)).sum(dim=-2)
+        grad_turn = (by_pixel * depth.flatten(-2)) @ pixel_grid(depth).mT
+        return (
+            grad_depth.view(*grad_depth.shape[:-1], 1, *depth.shape[-2:]).sum_to_size(depth.shape),
+            grad_turn.sum_to_size(turn.shape),
+            by_pixel.sum(dim=-1, keepdim=True).sum_to_size(shift.shape),
+            None,
+        )
+
+
+def _scales(size: tuple[int, int] | torch.Size) -> tuple[float, float]:
+    """Return what pixels (u, v) of an image of `size` (H, W) are multiplied by to span 2."""
+    height, width = size
+    return 2 / (width - 1), 2 / (height - 1)
+
+
+def _rendered(grid: Tensor, z: Tensor, images: Tensor, masks: Tensor, in_front_only: bool) -> Warp:
+    fixed = grid.detach()
+    u, v = fixed.abs().unbind(-1)
+    seen = (torch.maximum(u, v) <= 1.0).unsqueeze(-3)
     if in_front_only:
         seen &= z.detach().view(seen.shape) > 0
-    return Warp(sample(images, grid), seen * sample(masks, grid.detach(), mode="nearest"), grid)
+    return Warp(sample(images, grid), seen * sample(masks, fixed, mode="nearest"), grid)
 
 
 def sampling_grid(points: Tensor, intrinsics: Tensor, size: tuple[int, int] | torch.Size) -> tuple[Tensor, Tensor]:
@@ -66,7 +130,7 @@ def sampling_grid(points: Tensor, intrinsics: Tensor, size: tuple[int, int] | to
 
 
 def sample(images: Tensor, grid: Tensor, mode: str = "bilinear") -> Tensor:
-    """Sample `images` [..., C, H, W] at `grid` [..., H, W, 2]; zero outside.
+    """Sample `images` [..., C, H, W] at `grid` [..., h, w, 2]; zero outside.
 
     Points near the source's focal plane project to very large coordinates; they are brought to a place that is outside
     as well, because interpolation weights of infinite coordinates are NaN.
@@ -76,41 +140,97 @@ def sample(images: Tensor, grid: Tensor, mode: str = "bilinear") -> Tensor:
     return sampled.view(*images.shape[:-2], *sampled.shape[-2:])
 
 
+class Whole(Protocol):
+    """A view of which only a part is given."""
+
+    def variance(self, part: Tensor, center: Tensor) -> Tensor:
+        """Return the mean squared distance [..., 1, 1, 1] of all its pixels from `center` [..., 1, 1, 1]."""
+
+
+class KnownView(NamedTuple):
+    """Views that were measured before."""
+
+    mean: Tensor
+    """[..., 1, 1, 1] over channels and pixels."""
+    spread: Tensor
+    """[..., 1, 1, 1], the variance about it."""
+
+    @classmethod
+    def from_images(cls, images: Tensor) -> KnownView:
+        """Measure `images` [..., C, H, W]."""
+        mean = images.mean(_OVER_VIEW, keepdim=True)
+        return cls(mean, _mean_square(images - mean))
+
+    def at(self, index: Any) -> KnownView:
+        """Return those at an index into the leading dimensions."""
+        return KnownView(self.mean[index], self.spread[index])
+
+    def variance(self, part: Tensor, center: Tensor) -> Tensor:
+        """See `Whole`."""
+        return self.spread + (self.mean - center).square()
+
+
+class BlackBeyond(NamedTuple):
+    """Views that are black beyond the part."""
+
+    share: float
+    """Of a view, which the part is."""
+
+    def variance(self, part: Tensor, center: Tensor) -> Tensor:
+        """See `Whole`."""
+        return self.share * _mean_square(part - center) + (1 - self.share) * center.square()
+
+
+_AS_GIVEN = BlackBeyond(1.0)
+
+
 def align_intensity(
-    warped: Tensor, warp_mask: Tensor, target: Tensor, target_mask: Tensor, masked_deviation: bool
+    warped: Tensor,
+    warp_mask: Tensor,
+    target: Tensor,
+    target_mask: Tensor,
+    masked_deviation: bool,
+    whole_warped: Whole = _AS_GIVEN,
+    whole_target: Whole = _AS_GIVEN,
 ) -> Tensor:
     """Give `warped` [..., 3, H, W] the mean and deviation that `target` has where both are valid (method section 5).
 
     Cameras differ in exposure. Masks are [..., 1, H, W]; no gradient flows through the statistics. A view without
-    overlap is left as it is. `masked_deviation` restricts the deviation to the overlap, the release takes all pixels.
+    overlap is left as it is. `masked_deviation` restricts the deviation to the overlap, the release takes all pixels of
+    the views, which may be more than those that are given.
     """
-    both = (warp_mask * target_mask) > 0
-    target_mean, target_std = overlap_statistics(target, both, masked_deviation)
-    warp_mean, warp_std = overlap_statistics(warped, both, masked_deviation)
+    both = (warp_mask * target_mask).sign()
+    target_mean, target_std = overlap_statistics(target, both, masked_deviation, whole_target)
+    warp_mean, warp_std = overlap_statistics(warped, both, masked_deviation, whole_warped)
     gain = target_std / (warp_std + _STD_EPSILON)
     offset = target_mean - warp_mean * gain
-    overlapping = both.any(dim=-1, keepdim=True).any(dim=-2, keepdim=True)
-    slope = torch.where(overlapping, gain * warp_mask, 1.0)
-    return torch.addcmul(torch.where(overlapping, offset * warp_mask, 0.0), warped, slope)
+    overlaps = both.amax(dim=_OVER_VIEW, keepdim=True)
+    slope = torch.addcmul(1 - overlaps, warp_mask, overlaps * gain)
+    return torch.addcmul(overlaps * offset * warp_mask, warped, slope)
 
 
 @torch.no_grad()
-def overlap_statistics(images: Tensor, overlap: Tensor, masked_deviation: bool) -> tuple[Tensor, Tensor]:
+def overlap_statistics(
+    images: Tensor, overlap: Tensor, masked_deviation: bool, whole: Whole = _AS_GIVEN
+) -> tuple[Tensor, Tensor]:
     """Return mean and standard deviation [..., 1, 1, 1] of `images` [..., C, H, W] over `overlap` [..., 1, H, W].
 
-    One number per view over channels and pixels. The deviation is around the masked mean, over all pixels unless
-    `masked_deviation`.
+    One number per view over channels and pixels. The deviation is around the masked mean, over all pixels of the
+    `whole` views unless `masked_deviation`.
     """
-    over_view = (-3, -2, -1)
     weights = overlap.to(images.dtype)
-    count = (weights.sum(over_view, keepdim=True) * images.shape[-3]).clamp(min=1)
+    count = (weights.sum(_OVER_VIEW, keepdim=True) * images.shape[-3]).clamp(min=1)
     mean = _weighted_sum(images, weights) / count
     if masked_deviation:
-        variance = _weighted_sum((images - mean).square(), weights) / count
+        variance = _weighted_sum((images - mean).square_(), weights) / count
     else:
-        spread, center = torch.var_mean(images, over_view, correction=0, keepdim=True)
-        variance = spread + (center - mean).square()
+        variance = whole.variance(images, mean)
     return mean, (variance + _STD_EPSILON**2).sqrt()
+
+
+def _mean_square(differences: Tensor) -> Tensor:
+    """Return the mean [..., 1, 1, 1] over channels and pixels of the squares, in the place of the differences."""
+    return differences.square_().mean(_OVER_VIEW, keepdim=True)
 
 
 def _weighted_sum(images: Tensor, weights: Tensor) -> Tensor:

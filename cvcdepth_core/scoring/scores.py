@@ -48,7 +48,7 @@ class ScoreSettings(BaseModel):
     max_depth: float = Field(default=80.0, gt=0, allow_inf_nan=False)
     """Metres; truth at or beyond it is left out, predictions are clamped to it."""
     range_edges: tuple[float, ...] = (0.0, 10.0, 20.0, 40.0, 80.0)
-    """Metres of true depth at which range bins begin; the last one is open."""
+    """Metres of true depth at which range bins begin; the last one is open. None: there are no bins."""
     pool: int = Field(default=4, ge=1)
     """Consecutive images of a camera that form one pool."""
 
@@ -63,6 +63,8 @@ class ScoreSettings(BaseModel):
     @property
     def range_names(self) -> list[str]:
         """The names of the range bins: `0-10`, ..., `80+`."""
+        if not self.range_edges:
+            return []
         *inner, last = self.range_edges
         return [f"{a:g}-{b:g}" for a, b in zip(inner, self.range_edges[1:], strict=True)] + [f"{last:g}+"]
 

@@ -14,14 +14,24 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
-from cvcdepth_core.rendering.photometric import masked_mean, photometric_error
-from cvcdepth_core.rendering.projection import back_project, rigid_inverse, transform
-from cvcdepth_core.rendering.view_synthesis import Warp, align_intensity, sample, splat_depth, sum_by_target, warp_views
+from cvcdepth_core.rendering.photometric import TargetStatistics, masked_mean, photometric_error, weighted_mean
+from cvcdepth_core.rendering.projection import Reprojection, back_project, rigid_inverse, transform
+from cvcdepth_core.rendering.strips import Strips, seen_columns
+from cvcdepth_core.rendering.view_synthesis import (
+    BlackBeyond,
+    KnownView,
+    Warp,
+    align_intensity,
+    sample,
+    splat_depth,
+    warp_by_depth,
+)
 from cvcdepth_core.training.batch import RigBatch
 from cvcdepth_core.training.losses import auto_mask, pose_consistency, smoothness
 from cvcdepth_core.training.motion import motions_seen_from_anchor, relative_poses
 
 _IDENTITY_NOISE = 1e-5
+_OVER_VIEW = (-3, -2, -1)
 
 
 class ObjectiveConfig(BaseModel):
@@ -66,14 +76,26 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Overlap:
-    """Views of every camera rendered from its neighbours' images."""
+    """Views of every camera rendered from its neighbours' images, in the columns where these may see something."""
 
-    images: Tensor
-    """[B, 1 + F, N, 3, H, W], intensity aligned; frame 0 is spatial, the others spatio-temporal."""
-    masks: Tensor
-    """[B, 1 + F, N, 1, H, W], how much of each pixel a neighbour saw."""
+    strips: Strips
+    """Where: S strips of w columns."""
+    strip_images: Tensor
+    """[B, 1 + F, S, 3, H, w], intensity aligned; frame 0 is spatial, the others spatio-temporal."""
+    strip_masks: Tensor
+    """[B, 1 + F, S, 1, H, w], how much of each pixel a neighbour saw."""
     depth: Tensor | None
     """[B, N, 1, H, W] the neighbours' depth as metres along this camera's axis, 0 where unknown."""
+
+    @property
+    def images(self) -> Tensor:
+        """[B, 1 + F, N, 3, H, W] the whole views."""
+        return self.strips.paste(self.strip_images)
+
+    @property
+    def masks(self) -> Tensor:
+        """[B, 1 + F, N, 1, H, W] their masks."""
+        return self.strips.paste(self.strip_masks)
 
 
 @dataclass(frozen=True)
@@ -85,6 +107,28 @@ class Views:
     temporal_masks: Tensor
     """[B, F, N, 1, H, W]."""
     overlap: Overlap
+
+
+@dataclass(frozen=True)
+class MaskedError:
+    """A term's error map and mask, in strips if it is of the overlap."""
+
+    error: Tensor
+    mask: Tensor
+    strips: Strips | None = None
+
+    def mean(self) -> Tensor:
+        """Return the masked mean [..., N] of each camera."""
+        if self.strips is None:
+            return masked_mean(self.error, self.mask)
+        sums = ((self.error * self.mask).sum(_OVER_VIEW), self.mask.sum(_OVER_VIEW))
+        return weighted_mean(*map(self.strips.sum_of_cameras, sums))
+
+    def whole(self) -> tuple[Tensor, Tensor]:
+        """Return error map and mask of the whole images [..., N, 1, H, W]."""
+        if self.strips is None:
+            return self.error, self.mask
+        return self.strips.paste(self.error), self.strips.paste(self.mask)
 
 
 @dataclass(frozen=True)
@@ -115,8 +159,8 @@ def evaluate_objective(
         if config.corrected:
             batch = _with_binary_masks(batch)
         views = synthesise_views(batch, prediction, config)
-        errors = masked_errors(batch, prediction, views, config, identity_noise)
-        terms = {name: masked_mean(error, mask) for name, (error, mask) in errors.items()}
+        errors = _masked_errors(batch, prediction, views, config, identity_noise)
+        terms = {name: error.mean() for name, error in errors.items()}
         if "reconstruction_consistency" in terms:
             terms["reconstruction_consistency"] = terms["reconstruction_consistency"].mean(dim=1)
         if config.smoothness > 0:
@@ -141,71 +185,100 @@ def _with_binary_masks(batch: RigBatch) -> RigBatch:
 def synthesise_views(batch: RigBatch, prediction: Prediction, config: ObjectiveConfig) -> Views:
     """Render every view that the terms of `config` compare: all samples, frames and cameras in two warps."""
     batch = batch.at_exposures(prediction.motions[:, :, batch.anchor])
-    points = back_project(prediction.depth, batch.inverse_intrinsics)
-    temporal = warp_views(
-        points=points[:, None],
+    intrinsics, inverse = batch.intrinsics, batch.inverse_intrinsics
+    targets = KnownView.from_images(batch.images)
+    temporal = warp_by_depth(
+        depth=prediction.depth[:, None],
         images=batch.contexts,
         masks=batch.masks[:, None].expand_as(batch.contexts[:, :, :, :1]),
-        source_T_target=prediction.motions,
-        intrinsics=batch.intrinsics[:, None],
+        source_of_target=Reprojection.from_cameras(inverse[:, None], prediction.motions, intrinsics[:, None]),
         in_front_only=config.corrected,
     )
     return Views(
         temporal=align_intensity(
-            temporal.images, temporal.masks, batch.images[:, None], batch.masks[:, None], config.corrected
+            temporal.images,
+            temporal.masks,
+            batch.images[:, None],
+            batch.masks[:, None],
+            config.corrected,
+            whole_target=targets.at((slice(None), None)),
         ),
         temporal_masks=temporal.masks,
-        overlap=_synthesise_overlap(batch, prediction, points, config),
+        overlap=_synthesise_overlap(batch, prediction, targets, config),
     )
 
 
-def _synthesise_overlap(batch: RigBatch, prediction: Prediction, points: Tensor, config: ObjectiveConfig) -> Overlap:
-    targets, sources = batch.targets, batch.sources
-    source_T_target = relative_poses(batch.base_T_camera, targets, sources)
-    warp = _warp_neighbours(batch, prediction, points, source_T_target, config)
-    target_images, target_masks = batch.images[:, None, targets], batch.masks[:, None, targets]
-    aligned = align_intensity(warp.images, warp.masks, target_images, target_masks, config.corrected)
-    images = sum_by_target(aligned, targets, batch.cameras)
-    masks = sum_by_target(warp.masks, targets, batch.cameras)
+def _synthesise_overlap(
+    batch: RigBatch, prediction: Prediction, whole_targets: KnownView, config: ObjectiveConfig
+) -> Overlap:
+    source_T_target = relative_poses(batch.base_T_camera, batch.targets, batch.sources)
+    strips, warp = _warp_neighbours(batch, prediction, source_T_target, config)
+    aligned = align_intensity(
+        warp.images,
+        warp.masks,
+        strips.of_pairs(strips.cut(batch.images))[:, None],
+        strips.of_pairs(strips.cut(batch.masks))[:, None],
+        config.corrected,
+        whole_warped=BlackBeyond(strips.share),
+        whole_target=whole_targets.at((slice(None), None, batch.targets)),
+    )
+    images, masks = strips.sum_of_pairs(aligned), strips.sum_of_pairs(warp.masks)
     depth = None
     if config.depth_consistency > 0:
-        depth = _neighbours_depth(batch, points, source_T_target, warp, config)
+        depth = _neighbours_depth(batch, prediction, source_T_target, strips, warp, config)
     if config.corrected:
         images, masks = images / masks.clamp(min=1), masks.clamp(max=1)
-    return Overlap(images, masks, depth)
+    return Overlap(strips, images, masks, depth)
 
 
 def _warp_neighbours(
-    batch: RigBatch, prediction: Prediction, points: Tensor, source_T_target: Tensor, config: ObjectiveConfig
-) -> Warp:
-    """Render each pair's target from its source at every frame, [B, 1 + F, P, ...]."""
+    batch: RigBatch, prediction: Prediction, source_T_target: Tensor, config: ObjectiveConfig
+) -> tuple[Strips, Warp]:
+    """Render each pair's target from its source at every frame, [B, 1 + F, P, ...], where the source may be seen."""
     standstill = torch.eye(4).to(prediction.motions).expand_as(prediction.motions[:, :1])
     frame_T_target = torch.cat([standstill, prediction.motions], dim=1)[:, :, batch.targets]
+    source_of_target = Reprojection.from_cameras(
+        batch.inverse_intrinsics[:, None, batch.targets],
+        source_T_target[:, None] @ frame_T_target,
+        batch.intrinsics[:, None, batch.sources],
+    )
+    targets = batch.targets.tolist()
+    seen = seen_columns(prediction.depth, batch.targets, source_of_target)
+    strips = Strips.from_intervals(seen, targets, batch.cameras, prediction.depth.shape[-1])
     images = batch.frames[:, :, batch.sources]
-    return warp_views(
-        points=points[:, None, batch.targets],
+    warp = warp_by_depth(
+        depth=strips.of_pairs(strips.cut(prediction.depth))[:, None],
         images=images,
         masks=batch.masks[:, None, batch.sources].expand_as(images[:, :, :, :1]),
-        source_T_target=source_T_target[:, None] @ frame_T_target,
-        intrinsics=batch.intrinsics[:, None, batch.sources],
+        source_of_target=source_of_target.from_column(strips.first_of_pairs(images)),
         in_front_only=config.corrected,
     )
+    return strips, warp
 
 
 def _neighbours_depth(
-    batch: RigBatch, points: Tensor, source_T_target: Tensor, warp: Warp, config: ObjectiveConfig
+    batch: RigBatch,
+    prediction: Prediction,
+    source_T_target: Tensor,
+    strips: Strips,
+    warp: Warp,
+    config: ObjectiveConfig,
 ) -> Tensor:
     """Bring the neighbours' depth to each camera [B, N, 1, H, W]: z in this camera's frame, 0 where unknown."""
     targets, sources = batch.targets, batch.sources
-    in_target = transform(rigid_inverse(source_T_target), points[:, sources])
+    target_T_source = rigid_inverse(source_T_target)
     if config.depth_warping == "dcl":
+        points = back_project(prediction.depth, batch.inverse_intrinsics)
+        in_target = transform(target_T_source, points[:, sources])
         return splat_depth(in_target, batch.masks[:, sources], batch.intrinsics[:, targets], targets, batch.cameras)
-    source_z = in_target[:, :, 2:].reshape(warp.masks[:, 0].shape)
-    warped = sample(source_z, warp.grid[:, 0])
+    target_of_source = Reprojection.from_cameras(
+        batch.inverse_intrinsics[:, sources], target_T_source, batch.intrinsics[:, targets]
+    )
+    warped = sample(target_of_source.z(prediction.depth[:, sources]), warp.grid[:, 0])
     if not config.corrected:
-        return sum_by_target(warped, targets, batch.cameras)
-    count = sum_by_target(warp.masks[:, 0], targets, batch.cameras)
-    return sum_by_target(warped * warp.masks[:, 0], targets, batch.cameras) / count.clamp(min=1)
+        return strips.paste(strips.sum_of_pairs(warped))
+    count = strips.sum_of_pairs(warp.masks[:, 0])
+    return strips.paste(strips.sum_of_pairs(warped * warp.masks[:, 0]) / count.clamp(min=1))
 
 
 def masked_errors(
@@ -213,27 +286,51 @@ def masked_errors(
 ) -> dict[str, tuple[Tensor, Tensor]]:
     """Return the error map and mask of every term that is a masked mean, [B, N, 1, H, W] each.
 
-    Those of `reconstruction_consistency` are [B, F, N, 1, H, W]: the frames are averaged after the masked mean.
+    Those of `reconstruction_consistency` are [B, F, N, 1, H, W]: the frames are averaged after the masked mean. Where
+    no neighbour can be seen, the error of a term of the overlap is zero.
     """
-    target, overlap = batch.images[:, None], views.overlap
-    reprojection = photometric_error(views.temporal, target).amin(dim=1)
-    auto_masks = auto_mask(reprojection, _identity_error(batch, identity_noise)) * batch.masks
-    spatial_mask = batch.masks * overlap.masks[:, 0]
-    st_masks = batch.masks[:, None] * overlap.masks[:, 1:] * auto_masks[:, None]
-    spatial, spatio_temporal = overlap.images[:, :1], overlap.images[:, 1:]
-    errors = {"temporal": (reprojection, auto_masks)}
+    errors = _masked_errors(batch, prediction, views, config, identity_noise)
+    return {name: error.whole() for name, error in errors.items()}
+
+
+def _masked_errors(
+    batch: RigBatch, prediction: Prediction, views: Views, config: ObjectiveConfig, identity_noise: Tensor | None
+) -> dict[str, MaskedError]:
+    target = batch.images[:, None]
+    statistics = TargetStatistics.from_images(target)
+    reprojection = photometric_error(views.temporal, target, statistics).amin(dim=1)
+    auto_masks = auto_mask(reprojection, _identity_error(batch, statistics, identity_noise)) * batch.masks
+    errors = {"temporal": MaskedError(reprojection, auto_masks)} | _overlap_errors(
+        batch, views.overlap, auto_masks, config
+    )
+    depth = views.overlap.depth
+    if depth is not None:
+        seen = batch.masks * views.overlap.strips.paste(views.overlap.strip_masks[:, 0])
+        mask = batch.masks * _depth_mask(depth, seen, config)
+        errors["depth_consistency"] = MaskedError((depth - prediction.depth).abs(), mask)
+    return errors
+
+
+def _overlap_errors(
+    batch: RigBatch, overlap: Overlap, auto_masks: Tensor, config: ObjectiveConfig
+) -> dict[str, MaskedError]:
+    """Return those of the photometric terms of the overlap."""
+    strips = overlap.strips
+    target, own_masks = strips.cut(batch.images)[:, None], strips.cut(batch.masks)
+    statistics = TargetStatistics.from_images(target)
+    frames = [1, overlap.strip_images.shape[1] - 1]
+    spatial, spatio_temporal = overlap.strip_images.split(frames, dim=1)  # type: ignore[no-untyped-call]
+    spatial_mask = own_masks * overlap.strip_masks[:, 0]
+    st_masks = own_masks[:, None] * overlap.strip_masks[:, 1:] * strips.cut(auto_masks)[:, None]
+    errors = {}
     if config.spatial > 0:
-        errors["spatial"] = (photometric_error(spatial, target).squeeze(1), spatial_mask)
+        errors["spatial"] = MaskedError(photometric_error(spatial, target, statistics).squeeze(1), spatial_mask, strips)
     if config.spatio_temporal > 0:
-        errors["spatio_temporal"] = (photometric_error(spatio_temporal, target).amin(dim=1), st_masks.amax(dim=1))
-    if overlap.depth is not None:
-        difference = (overlap.depth - prediction.depth).abs()
-        errors["depth_consistency"] = (difference, batch.masks * _depth_mask(overlap.depth, spatial_mask, config))
+        least = photometric_error(spatio_temporal, target, statistics).amin(dim=1)
+        errors["spatio_temporal"] = MaskedError(least, st_masks.amax(dim=1), strips)
     if config.reconstruction_consistency > 0:
-        errors["reconstruction_consistency"] = (
-            photometric_error(spatio_temporal, spatial),
-            st_masks * spatial_mask[:, None],
-        )
+        difference = photometric_error(spatio_temporal, spatial)
+        errors["reconstruction_consistency"] = MaskedError(difference, st_masks * spatial_mask[:, None], strips)
     return errors
 
 
@@ -243,8 +340,8 @@ def _depth_mask(neighbours_depth: Tensor, spatial_mask: Tensor, config: Objectiv
 
 
 @torch.no_grad()
-def _identity_error(batch: RigBatch, noise: Tensor | None) -> Tensor:
+def _identity_error(batch: RigBatch, of_targets: TargetStatistics, noise: Tensor | None) -> Tensor:
     """Return the least error [B, N, 1, H, W] of taking a context frame for the target as it is."""
-    error = photometric_error(batch.contexts, batch.images[:, None])
+    error = photometric_error(batch.contexts, batch.images[:, None], of_targets)
     noise = torch.randn_like(error) if noise is None else noise
     return (error + _IDENTITY_NOISE * noise).amin(dim=1)

@@ -10,22 +10,22 @@ from typing import NamedTuple
 import numpy as np
 
 from cvcdepth_core.rig.poses import Pose
-from cvcdepth_core.worlds.barriers import build_barriers, build_wires
-from cvcdepth_core.worlds.buildings import build_buildings
 from cvcdepth_core.worlds.description import Sky, Weather, WorldSpec
-from cvcdepth_core.worlds.furniture import LAMP_ARM, build_furniture, furniture_height
-from cvcdepth_core.worlds.ground import build_ground, build_patches
-from cvcdepth_core.worlds.horizon import build_horizon, build_tall_grass
-from cvcdepth_core.worlds.light import Lamps, Light, sun_direction, sunlight
-from cvcdepth_core.worlds.meshes import Mesh
-from cvcdepth_core.worlds.own_body import BodyKind, own_body
-from cvcdepth_core.worlds.people import build_people, person_mesh
-from cvcdepth_core.worlds.roads import build_roads
+from cvcdepth_core.worlds.rendering.light import Lamps, Light, sun_direction, sunlight
+from cvcdepth_core.worlds.shapes.barriers import build_barriers, build_wires
+from cvcdepth_core.worlds.shapes.buildings import build_buildings
+from cvcdepth_core.worlds.shapes.furniture import LAMP_ARM, build_furniture, furniture_height
+from cvcdepth_core.worlds.shapes.ground import build_ground, build_patches
+from cvcdepth_core.worlds.shapes.horizon import build_horizon, build_tall_grass
+from cvcdepth_core.worlds.shapes.meshes import Mesh
+from cvcdepth_core.worlds.shapes.own_body import BodyKind, own_body
+from cvcdepth_core.worlds.shapes.people import build_people, person_mesh
+from cvcdepth_core.worlds.shapes.roads import build_roads
+from cvcdepth_core.worlds.shapes.structures import build_structures, ceiling_lamps
+from cvcdepth_core.worlds.shapes.trees import build_trees
+from cvcdepth_core.worlds.shapes.vehicles import build_vehicles, vehicle_mesh
 from cvcdepth_core.worlds.site import Site
-from cvcdepth_core.worlds.structures import build_structures, ceiling_lamps
 from cvcdepth_core.worlds.trajectories import Trajectory, person_trajectory, vehicle_trajectory
-from cvcdepth_core.worlds.trees import build_trees
-from cvcdepth_core.worlds.vehicles import build_vehicles, vehicle_mesh
 from cvcdepth_core.worlds.world import Mover, World
 
 _SKY_LIGHT: dict[Weather, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
@@ -96,6 +96,7 @@ def build_light(sky: Sky, lamps: Lamps) -> Light:
         cloud_offset=(u, v),
         visibility=sky.visibility,
         lamps=lamps,
+        dark=sky.weather in ("dusk", "night"),
     )
 
 
@@ -106,7 +107,7 @@ def _moving_vehicles(site: Site) -> list[Mover]:
             mesh = vehicle_mesh(site, vehicle)
             length = float(np.ptp(mesh.vertices[:, 0]))
             way = vehicle_trajectory(site, vehicle, vehicle.motion, length)
-            found.append(Mover(site.new_object(vehicle.kind), mesh, way))
+            found.append(Mover(site.new_object(vehicle.kind), mesh, way, headlights=True))
     return found
 
 

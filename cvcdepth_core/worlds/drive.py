@@ -13,14 +13,14 @@ from pydantic import Field
 from cvcdepth_core.rig.rig import Camera
 from cvcdepth_core.rig.rig_file import RigLayout
 from cvcdepth_core.worlds.building import build_world
-from cvcdepth_core.worlds.camera_response import daylight_of, develop
 from cvcdepth_core.worlds.description import Part, WorldSpec
-from cvcdepth_core.worlds.lenses import Lens
-from cvcdepth_core.worlds.lidar import Sweep, sweep
 from cvcdepth_core.worlds.odometry import Told, told_motion
-from cvcdepth_core.worlds.own_body import check_start
-from cvcdepth_core.worlds.renderer import Renderer, Truth
+from cvcdepth_core.worlds.rendering.camera_response import daylight_of, develop
+from cvcdepth_core.worlds.rendering.lenses import Lens
+from cvcdepth_core.worlds.rendering.lidar import Sweep, sweep
+from cvcdepth_core.worlds.rendering.renderer import Renderer, Truth
 from cvcdepth_core.worlds.sensors import Sensors
+from cvcdepth_core.worlds.shapes.own_body import check_start
 
 _BEFORE = 0.3  # seconds of motion that are told before the first set and after the last
 _CAMERA, _LIDAR, _ODOMETRY = 1, 2, 3  # streams of noise

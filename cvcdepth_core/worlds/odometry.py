@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from cvcdepth_core.rig.poses import Pose, inverse
-from cvcdepth_core.worlds.meshes import yaw_rotation
 from cvcdepth_core.worlds.sensors import Odometry
+from cvcdepth_core.worlds.shapes.meshes import yaw_rotation
 from cvcdepth_core.worlds.world import Way
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cvcdepth_core.worlds.meshes import Floats
+from cvcdepth_core.worlds.shapes.meshes import Floats
 
 _STEP = 0.25  # metres; between them the curve is an arc to 1e-6 m
 _SEARCH_STEP = 4  # samples: the spacing at which the nearest place is first looked for
@@ -58,9 +58,9 @@ class Path:
         middles = (np.arange(len(self._curvature)) + 0.5) * _STEP
         return np.where(self._inside(s), np.interp(s, middles, self._curvature), 0.0)
 
-    def points(self, s: Floats | float, l: Floats | float = 0.0) -> Floats:  # noqa: E741
+    def points(self, s: Floats | float, lateral: Floats | float = 0.0) -> Floats:
         """x, y [..., 2] at s along the curve and l to its left."""
-        s, left = np.broadcast_arrays(np.asarray(s, np.float64), np.asarray(l, np.float64))
+        s, left = np.broadcast_arrays(np.asarray(s, np.float64), np.asarray(lateral, np.float64))
         i, ds = self._sample(s)
         turn = np.where(self._inside(s), self._curvature[i], 0.0) * ds / 2
         heading = self._heading[i] + turn

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from cvcdepth_core.worlds.description import Part, Share
-from cvcdepth_core.worlds.dice import Dice
+from cvcdepth_core.worlds.generation.dice import Dice
 
 Positive = Annotated[float, Field(gt=0.0)]
 

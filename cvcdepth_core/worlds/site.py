@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from cvcdepth_core.worlds.description import Placed, Point, WorldSpec
-from cvcdepth_core.worlds.materials import Material, MaterialTable
-from cvcdepth_core.worlds.meshes import Floats, Ints, Mesh, joined
+from cvcdepth_core.worlds.shapes.meshes import Floats, Ints, Mesh, joined
+from cvcdepth_core.worlds.surfaces.materials import Material, MaterialTable
 from cvcdepth_core.worlds.terrain import Corridor, Terrain
 
 

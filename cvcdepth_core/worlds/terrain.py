@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from cvcdepth_core.worlds.description import Bank, Ground, Road
-from cvcdepth_core.worlds.meshes import Floats
-from cvcdepth_core.worlds.noise import Noise, noise
 from cvcdepth_core.worlds.paths import Path, eased
+from cvcdepth_core.worlds.shapes.meshes import Floats
+from cvcdepth_core.worlds.surfaces.noise import Noise, noise
 
 _FADE = 7.0  # metres from another road, over which a bank is levelled
 _ROUND = 2.0  # metres over which a bank begins

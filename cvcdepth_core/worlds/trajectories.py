@@ -11,8 +11,8 @@ import numpy as np
 
 from cvcdepth_core.rig.poses import Pose
 from cvcdepth_core.worlds.description import Drive, Motion, Placed
-from cvcdepth_core.worlds.meshes import Floats, cross
 from cvcdepth_core.worlds.paths import Path, eased
+from cvcdepth_core.worlds.shapes.meshes import Floats, cross
 from cvcdepth_core.worlds.site import Site
 
 _PITCH_PER_ACCELERATION = 0.006  # radians per m/s^2: a sprung body

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from cvcdepth_core.rig.poses import Pose
-from cvcdepth_core.worlds.light import Light
-from cvcdepth_core.worlds.meshes import Floats, Ints, Mesh
+from cvcdepth_core.worlds.rendering.light import Light
+from cvcdepth_core.worlds.shapes.meshes import Floats, Ints, Mesh
 
 SKY, OWN_VEHICLE = 0, 1
 """Numbers of objects that every world has; the others follow."""
@@ -36,6 +36,8 @@ class Mover:
     mesh: Mesh
     """In its own frame: x forward, z up, on the ground."""
     way: Way
+    headlights: bool = False
+    """Whether it has some, for when it is dark."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from cvcdepth_core.errors import RecordingError
 from cvcdepth_ros.commands.arguments import add_recording, add_rig, add_settings, rig_layout, settings_from
 from cvcdepth_ros.console import positive
-from cvcdepth_ros.installation import package_version
+from cvcdepth_ros.installation import package_version, require_ros
 from cvcdepth_ros.settings import ModelSettings
 
 if TYPE_CHECKING:
@@ -52,6 +52,7 @@ def execute(arguments: argparse.Namespace) -> None:
     from cvcdepth_ros.recordings.rig import RecordedRig
 
     model = settings_from(arguments, ModelSettings)
+    require_ros("bench")
     with tempfile.TemporaryDirectory(prefix="cvcdepth_bench_") as folder, open_recording(arguments.recording) as source:
         given = rig_layout(arguments)
         recorded = RecordedRig.from_recording(source, given, arguments.base_frame)

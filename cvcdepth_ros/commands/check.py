@@ -23,7 +23,7 @@ from cvcdepth_ros.commands.arguments import (
     rig_layout,
     window_ns,
 )
-from cvcdepth_ros.console import positive, print_result
+from cvcdepth_ros.console import Style, positive, print_result, styled, terminal_width
 from cvcdepth_ros.settings import MatchingSettings
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ EXAMPLES: tuple[str, ...] = (
     "check drives/ --rig rig.yaml --tolerance 0.05 --lidar /lidar/points --json",
 )
 
-_WIDTH = 118
+_GREATEST_WIDTH = 118
 _INDENT = 25
 
 
@@ -142,7 +142,11 @@ def _text(checked: Checked) -> str:
 
 def _lines(numbered: "NumberedResult") -> Iterator[str]:
     number, name, result = numbered
-    yield from _wrapped(f"{number:>4}  {_SIGNS[result.status]}  {name}", result.finding)
+    sign = _SIGNS[result.status]
+    first, *others = _wrapped(f"{number:>4}  {sign}  {name}", result.finding)
+    style = _STYLES.get(result.status)
+    yield first.replace(sign, styled(sign, style), 1) if style else first
+    yield from others
     if result.remedy:
         yield from _wrapped("", f"-> {result.remedy}")
 
@@ -150,12 +154,19 @@ def _lines(numbered: "NumberedResult") -> Iterator[str]:
 _SIGNS = {"passed": "ok  ", "warning": "warn", "failed": "FAIL", "skipped": "-   "}
 
 
+_STYLES: dict["Status", Style] = {"passed": "green", "warning": "yellow", "failed": "red"}
+
+
 def _wrapped(label: str, text: str) -> Sequence[str]:
     """Lay out a text beside its label."""
-    first, rest = f"{label:<{_INDENT}}", " " * _INDENT
-    return textwrap.wrap(
-        text, _WIDTH, initial_indent=first, subsequent_indent=rest, break_long_words=False, break_on_hyphens=False
+    layout = textwrap.TextWrapper(
+        min(_GREATEST_WIDTH, terminal_width()),
+        initial_indent=f"{label:<{_INDENT}}",
+        subsequent_indent=" " * _INDENT,
+        break_long_words=False,
+        break_on_hyphens=False,
     )
+    return layout.wrap(text)
 
 
 def _verdict(checked: Checked) -> str:

@@ -22,7 +22,7 @@ from cvcdepth_ros.commands.arguments import (
     rig_layout,
     settings_from,
 )
-from cvcdepth_ros.console import print_result, progress_bar, table, warn
+from cvcdepth_ros.console import paragraph, print_result, progress_bar, table, warn
 from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings, unique_names
 from cvcdepth_ros.reports import REPORT_FILE, can_draw_report
 
@@ -215,7 +215,7 @@ def _comparison_text(content: dict[str, Any]) -> str:
     header = ("", "A", "B", "B - A", f"{content['level']:.0%} interval", "")
     rows = [
         (
-            f"{name}{' (median-scaled)' if scaling == 'median' else ''}",
+            f"{name}{', scaled' if scaling == 'median' else ''}",
             *_difference_cells(difference, content["can_prove"]),
         )
         for scaling, differences in content["differences"].items()
@@ -225,10 +225,13 @@ def _comparison_text(content: dict[str, Any]) -> str:
         [
             f"A: {content['first']}",
             f"B: {content['second']}",
-            table(header, rows, numbers=range(1, 5)),
-            f"{content['sets']} sets in both; only in A {content['only_in_first']}, only in B "
-            f"{content['only_in_second']}; paired bootstrap of {content['resamples']} draws of blocks of "
-            f"{content['block']} sets",
+            table(header, rows, numbers=range(1, 5), apart=5),
+            paragraph(
+                f"{content['sets']} sets in both; only in A {content['only_in_first']}, only in B "
+                f"{content['only_in_second']}; paired bootstrap of {content['resamples']} draws of blocks of "
+                f"{content['block']} sets; the same: 0 is within the interval; scaled: each image by "
+                "median(truth) / median(prediction)"
+            ),
         ]
     )
 
@@ -238,8 +241,8 @@ def _difference_cells(difference: dict[str, float | None], can_prove: bool) -> t
     if first is None or second is None or change is None or low is None or high is None:
         return ("", "", "", "", "not known")
     outside = "different" if can_prove else "too few sets to say"
-    verdict = "the same within the interval" if low <= 0 <= high else outside
-    return (f"{first:.4f}", f"{second:.4f}", f"{change:+.4f}", f"{low:+.4f} to {high:+.4f}", verdict)
+    verdict = "the same" if low <= 0 <= high else outside
+    return (f"{first:.4f}", f"{second:.4f}", f"{change:+.4f}", f"{low:+.4f}..{high:+.4f}", verdict)
 
 
 def _workers(text: str) -> int:

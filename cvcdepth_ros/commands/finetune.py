@@ -179,8 +179,8 @@ def _score_table(scores: dict[str, Any]) -> str:
 
     before, after = scores["before"]["cameras"], scores["after"]["cameras"]
     rows = [
-        (camera, *score_pairs(numbers, after.get(camera, {}), arrow="->", unknown="-"))
+        (camera, *score_pairs(numbers, after.get(camera, {}), arrow="→", unknown="-"))
         for camera, numbers in before.items()
     ]
-    header = ("before -> after", *SCORE_TITLES.values())
-    return table(header, rows, numbers=range(1, len(header)))
+    titles = [title.removesuffix(" error") for title in SCORE_TITLES.values()]
+    return table(("before→after", *titles), rows, numbers=range(1, len(titles) + 1))

@@ -115,7 +115,7 @@ def _damage(summary: "RecordingSummary") -> Iterable[str]:
 def _topics(topics: Sequence["TopicSummary"]) -> str:
     header = ("topic", "type", "messages", "Hz", "gap ms", "gaps", "jitter ms", "clock ms", "size")
     rows = [_topic_row(topic) for topic in topics]
-    return "\n".join([table(header, rows, numbers=range(2, len(header))), *_odd_stamps(topics)])
+    return "\n".join([table(header, rows, numbers=range(2, len(header)), apart=0), *_odd_stamps(topics)])
 
 
 def _odd_stamps(topics: Sequence["TopicSummary"]) -> Iterator[str]:
@@ -150,7 +150,8 @@ def _cameras(cameras: Sequence["CameraSummary"]) -> str:
     rows = [_camera_row(camera) for camera in cameras]
     problems = [f"  {camera.problem}" for camera in cameras if camera.problem]
     problems += [f"  camera {camera.name}: camera_info: {note}" for camera in cameras for note in camera.notes]
-    return "\n".join([table(("camera", "size", "distortion", "frame", "images"), rows), *problems])
+    header = ("camera", "size", "distortion", "frame", "images")
+    return "\n".join([table(header, rows, apart=len(header) - 1), *problems])
 
 
 def _camera_row(camera: "CameraSummary") -> tuple[str, ...]:
@@ -160,7 +161,13 @@ def _camera_row(camera: "CameraSummary") -> tuple[str, ...]:
     else:
         size = "{}x{}".format(*calibration.image_size)
         distortion = calibration.distortion_model if any(calibration.d) else "none"
-    return (camera.name, size, distortion, camera.frame_id or "?", camera.encoding or "none readable")
+    return (camera.name, size, distortion, camera.frame_id or "?", _pictures(camera.encoding or "none readable"))
+
+
+def _pictures(encoding: str) -> str:
+    """Return image_transport's `bgr8; jpeg compressed bgr8` in two words; other encodings as they are."""
+    raw, _, packed = encoding.partition("; ")
+    return f"{packed.split()[0]} {raw}" if packed.endswith(f" compressed {raw}") else encoding
 
 
 def _milliseconds(seconds: float | None) -> str:

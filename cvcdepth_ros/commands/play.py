@@ -121,7 +121,7 @@ def _text(result: dict[str, Any]) -> str:
     rows = [(topic, str(count)) for topic, count in result["published"].items()]
     late = result["late_ms"]
     lines = [
-        table(("topic", "messages"), rows),
+        table(("topic", "messages"), rows, apart=0),
         f"{sum(result['published'].values())} messages in {result['seconds']:.1f} s"
         f"{' until interrupted' if result['interrupted'] else ''}; late by {late['p50']} ms at the median, "
         f"{late['p95']} ms p95, {late['max']} ms at most",

@@ -147,7 +147,7 @@ def _text(result: dict[str, Any]) -> str:
     ]
     header = ("camera", "yaw (deg)", "view (deg)", "size", "distortion", "mask", "images")
     return (
-        f"{table(header, cameras)}\n\n{_overlaps_text(result)}\n\n"
+        f"{table(header, cameras, apart=len(header) - 1)}\n\n{_overlaps_text(result)}\n\n"
         f"base frame {result['base_frame']}, anchor camera {result['anchor']}; written to {result['file']}"
     )
 

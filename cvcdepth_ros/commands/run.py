@@ -218,7 +218,7 @@ def _text(result: dict[str, Any]) -> str:
     stages = ", ".join(f"{stage} {total:.1f}" for stage, total in seconds.items() if stage != "total")
     return "\n".join(
         [
-            table(("camera", "images", "matched", "dropped"), cameras),
+            table(("camera", "images", "matched", "dropped"), cameras, apart=3),
             *(f"refused: {reason}" for reason in result["refused"]),
             *([f"not everything could be read: {result['damage']}"] if result["damage"] else []),
             *(f"note: {note}" for note in result["notes"]),

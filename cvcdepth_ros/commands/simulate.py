@@ -84,7 +84,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(arguments: argparse.Namespace) -> None:
     """Simulate, or go on with what was interrupted."""
-    from cvcdepth_core.worlds.ray_engine import require_engine
+    from cvcdepth_core.worlds.rendering.ray_engine import require_engine
     from cvcdepth_ros.simulation.recording import record
     from cvcdepth_ros.simulation.set_messages import Form
 
@@ -106,6 +106,8 @@ def _simulate_many(arguments: argparse.Namespace, workers: int) -> None:
     for option in ("sensors", "no_lidar"):
         if getattr(arguments, option):
             arguments.usage_error(f"argument --{option.replace('_', '-')}: not with --many")
+    if arguments.odometry != "exact":
+        arguments.usage_error("argument --odometry: shards hold the true motion")
     if arguments.images == "raw":
         arguments.usage_error("argument --images: shards hold jpeg or png")
     choices = ManyDrives(
@@ -118,7 +120,6 @@ def _simulate_many(arguments: argparse.Namespace, workers: int) -> None:
         arguments.rate or 10.0,
         arguments.samples,
         arguments.look,
-        arguments.odometry,
         arguments.body or "varied",
         arguments.stagger,
         arguments.readout or 0.0,

@@ -27,7 +27,7 @@ from cvcdepth_ros.end_to_end.live_run import LiveOutcome, LiveRun
 from cvcdepth_ros.end_to_end.paths import DemoPaths
 from cvcdepth_ros.end_to_end.processes import children
 from cvcdepth_ros.end_to_end.received import Output, ReceivedSets, node_outputs, sent_sets
-from cvcdepth_ros.installation import package_version
+from cvcdepth_ros.installation import package_version, require_ros
 from cvcdepth_ros.settings import MatchingSettings, ModelSettings
 
 SAMPLE = Path(__file__).parents[2] / "samples" / "pandaset_002_excerpt"
@@ -60,6 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def run(options: argparse.Namespace) -> DemoResult:
     """Play the recording to the node, write what it publishes and print a summary; DemoError when a process fails."""
     model = _model(options)
+    require_ros("the demo")
     paths = DemoPaths(options.output)
     paths.prepare()
     if model.notice:

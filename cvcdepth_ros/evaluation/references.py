@@ -46,9 +46,7 @@ class ReferenceScoring:
         Comparing depth with itself costs more than comparing it with truth: that is done `is_without_truth` only.
         """
         settings = job.settings
-        score_settings = ScoreSettings(
-            min_depth=settings.min_depth, max_depth=settings.max_depth, range_edges=(settings.min_depth,)
-        )
+        score_settings = ScoreSettings(min_depth=settings.min_depth, max_depth=settings.max_depth, range_edges=())
         self.problem = ""
         """Why there is no flat ground; empty where there is."""
         self._metres = settings.constant_depth

@@ -78,11 +78,11 @@ def card_text(card: Mapping[str, Any]) -> str:
 
 
 def score_pairs(
-    before: Mapping[str, float | None], after: Mapping[str, float | None], arrow: str = "→", unknown: str = "–"
+    before: Mapping[str, float | None], after: Mapping[str, float | None], arrow: str = " → ", unknown: str = "–"
 ) -> list[str]:
     """Return a cell `before → after` for each of `SCORE_TITLES`, of one camera's numbers."""
     pairs = [(before[name], after.get(name)) for name in SCORE_TITLES]
-    return [f" {arrow} ".join(unknown if number is None else f"{number:.3f}" for number in pair) for pair in pairs]
+    return [arrow.join(unknown if number is None else f"{number:.3f}" for number in pair) for pair in pairs]
 
 
 def _scores(result: EvaluationResult | None) -> dict[str, Any] | None:

@@ -2,7 +2,8 @@
 """A mailbox of depth one between the thread that receives images and the one that runs inference: newest set wins.
 
 A slow consumer must work on the newest set, not on a growing backlog. A set that is replaced before it was read, or
-that is too old when it is read (freshness gate), is dropped and counted.
+that is too old when it is read (freshness gate), is dropped and counted. Where a recording loops, sets of the new round
+may come before the clock has gone back: for a second they are old by that clock and taken all the same.
 """
 
 import math
@@ -17,6 +18,8 @@ from cvcdepth_core.stamps import NANOSECONDS, to_nanoseconds
 from cvcdepth_ros.surround_sets.synchronizer import SurroundSet
 
 T = TypeVar("T")
+
+_JUMP_NS = NANOSECONDS
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,8 @@ class Mailbox(Generic[T]):
         self._closed = False
         self._statistics = MailboxStatistics()
         self._stale_age: float | None = None
+        self._last_time = 0
+        self._now_at_jump: int | None = None
         self._changed = threading.Condition()
 
     @property
@@ -83,8 +88,10 @@ class Mailbox(Generic[T]):
         """Wait for a set that is fresh; None after `timeout` seconds (None: no limit), or as soon as closed."""
         deadline = None if timeout is None else time.monotonic() + timeout
         while (surround_set := self._take(deadline)) is not None:
-            age = 0 if self._max_age is None else self._clock() - surround_set.time_ns
-            fresh = self._max_age is None or age <= self._max_age
+            now = self._clock()
+            age = now - surround_set.time_ns
+            is_jump = self._jumps(surround_set.time_ns, now)
+            fresh = self._max_age is None or age <= self._max_age or is_jump
             with self._changed:
                 self._count("delivered" if fresh else "stale")
                 if not fresh:
@@ -106,6 +113,13 @@ class Mailbox(Generic[T]):
         """Snapshot of the counters."""
         with self._changed:
             return self._statistics
+
+    def _jumps(self, time_ns: int, now: int) -> bool:
+        """Whether the sets' time has gone back, as where a recording loops, and the clock is still to follow."""
+        if time_ns < self._last_time and self._max_age is not None and self._last_time - time_ns > self._max_age:
+            self._now_at_jump = now
+        self._last_time = time_ns
+        return self._now_at_jump is not None and 0 <= now - self._now_at_jump < _JUMP_NS
 
     def _take(self, deadline: float | None) -> SurroundSet[T] | None:
         with self._changed:

@@ -8,7 +8,7 @@ what was drawn for people.
 
 import re
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import SequenceMatcher
 from typing import NamedTuple
@@ -107,6 +107,7 @@ def find_cameras(
     before rectified (rectifying once, to the network's size, loses least).
     """
     seen = seen or {}
+    topic_types = {topic: type_ for topic, type_ in topic_types.items() if not is_output(topic, topic_types)}
     infos = sorted(topic for topic, type_ in topic_types.items() if type_ == CAMERA_INFO_TYPE)
     namespaces = {_parent(topic): topic for topic in infos if _last(topic) == _INFO}
     images = [topic for topic, type_ in topic_types.items() if type_ in image_types]
@@ -343,6 +344,16 @@ def _grouped(reasons: Mapping[str, str]) -> Iterator[str]:
 def _listed(topics: Sequence[str]) -> str:
     more = f" and {len(topics) - _MAX_LISTED} more" if len(topics) > _MAX_LISTED else ""
     return ", ".join(topics[:_MAX_LISTED]) + more
+
+
+def is_output(topic: str, topics: Container[str]) -> bool:
+    """Whether a topic is the rectified picture, or its camera_info, that a node or `run` of ours has put out.
+
+    They stand beside the depth of the same picture, where a camera's raw pictures do not.
+    """
+    namespace = topic.rpartition("/")[0]
+    beside = ("image_rect", "depth/image_rect", "depth/camera_info")
+    return all(f"{namespace}/{part}" in topics for part in beside) and f"{namespace}/image_raw" not in topics
 
 
 def _shortest_unique_names(namespaces: list[str]) -> dict[str, str]:

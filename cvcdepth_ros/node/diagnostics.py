@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node's statuses on `/diagnostics`, in diagnostic_updater's form: `node: subject`, level, values."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -15,6 +15,8 @@ from cvcdepth_ros.surround_sets.latencies import StageSummary
 from cvcdepth_ros.surround_sets.synchronizer import CameraStatistics, SynchronizerStatistics
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+
+UNKNOWN_LATENCY = "not known: images are not stamped in the node's time"
 
 _LEVELS = {
     CameraState.OK: OK,
@@ -63,14 +65,22 @@ def synchronisation_status(
 
 
 def inference_status(
-    summaries: Mapping[str, StageSummary], mailbox: MailboxStatistics, problem: str, model_id: str
+    summaries: Mapping[str, StageSummary],
+    mailbox: MailboxStatistics,
+    problem: str,
+    model_id: str,
+    unknown: Collection[str] = (),
 ) -> DiagnosticStatus:
-    """Return the stages' latencies in milliseconds, and the number of sets that never reached the network."""
-    values = {
+    """Return the stages' latencies in milliseconds, and the number of sets that never reached the network.
+
+    The latencies of `unknown` stages cannot be known.
+    """
+    values: dict[str, Any] = {
         f"{stage} {name}": value
         for stage, summary in summaries.items()
         for name, value in (("p50 (ms)", summary.p50_ms), ("p95 (ms)", summary.p95_ms), ("max (ms)", summary.max_ms))
     }
+    values |= dict.fromkeys(unknown, UNKNOWN_LATENCY)
     misses = {"deadline misses": mailbox.replaced + mailbox.stale}
     return status(ERROR if problem else OK, "inference", problem or model_id, values | misses)
 

@@ -1,58 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node's parameters: one model gives their defaults, descriptions, ranges and checks."""
+"""The node's parameters, declared and read: `NodeParameters` gives defaults, descriptions, ranges and checks."""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from typing import Any, Literal, get_args, get_origin
 
-from pydantic import Field, ValidationError
+from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
 
 from cvcdepth_core.errors import ConfigError, first_validation_message
-from cvcdepth_ros.settings import MatchingSettings, MissingCameraSettings, ModelSettings, OutputSettings
-
-AUTO = "auto"
+from cvcdepth_ros.settings import NodeParameters
 
 _QOS_PREFIX = "qos_overrides."
-
-CHANGEABLE_WHILE_RUNNING = ("checkpoint", "cloud_stride", "cloud_min_range", "cloud_max_range", "cloud_voxel")
-
-
-class NodeParameters(OutputSettings, MissingCameraSettings, MatchingSettings, ModelSettings):
-    """Everything that can be set; the docstring of each field is its ROS description."""
-
-    rig: str = AUTO
-    """Rig file (YAML), or 'auto': find the cameras among the live topics and their poses on /tf_static."""
-    base_frame: str = "base_link"
-    """With rig 'auto': the vehicle's frame. A rig file names its own."""
-    autostart: bool = True
-    """Configure and activate at start; switch off where a lifecycle manager does that."""
-    max_age: float = Field(0.5, ge=0, le=3600)
-    """Seconds (ROS time) after which a waiting set is not worth inference any more; 0 takes any age."""
-    max_image_mb: float = Field(64.0, gt=0, le=2000)
-    """Megabytes above which an image message is refused; queue_size such images are kept per camera at most."""
-    reliable: bool = False
-    """Subscribe images and camera_info reliably instead of with sensor-data QoS."""
-    stale_after: float = Field(1.0, gt=0, le=3600)
-    """Seconds without an image after which a camera counts as stale."""
-    frozen_after: float = Field(1.0, ge=0, le=3600)
-    """Seconds of the very same picture after which a camera counts as frozen and is left out; 0 accepts any."""
-    overlap_monitor: bool = True
-    """Compare neighbouring cameras in their overlaps, to tell of a shifted mount or a dirty lens in /diagnostics."""
-    trace: str = ""
-    """File for a trace of every stage that https://ui.perfetto.dev opens; at most 64 MB."""
-
-    def check_complete(self) -> None:
-        """Raise ConfigError where the parameters are each possible but together not enough to start with."""
-        if not self.rig:
-            raise ConfigError(f"parameter rig is empty: name a rig file, or '{AUTO}'")
-        if self.untrained and self.checkpoint:
-            raise ConfigError(
-                f"parameters checkpoint '{self.checkpoint}' and untrained true: a checkpoint is trained; name none "
-                "to run random weights"
-            )
 
 
 def declare_parameters(node: Node) -> None:

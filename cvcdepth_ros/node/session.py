@@ -13,12 +13,14 @@ from cvcdepth_core.errors import CvcDepthError
 from cvcdepth_core.estimator import DepthEstimator
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.rig_health.overlap_monitor import OverlapMonitor
-from cvcdepth_core.stamps import NANOSECONDS, exposure_times
+from cvcdepth_core.stamps import exposure_times
 from cvcdepth_ros.live.camera_states import CameraCondition, CameraState, CameraWatch, Trouble, condition
 from cvcdepth_ros.live.mailbox import Mailbox
 from cvcdepth_ros.live.picture_preparation import CameraImage
 from cvcdepth_ros.live.pipeline import SurroundPipeline
 from cvcdepth_ros.live.set_progress import NodeClock, SetProgress
+from cvcdepth_ros.live.stamp_ages import StampAges
+from cvcdepth_ros.live.transport_loss import TransportLoss
 from cvcdepth_ros.messages.conversion import stamp_ns
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
 from cvcdepth_ros.node.diagnostics import (
@@ -28,9 +30,11 @@ from cvcdepth_ros.node.diagnostics import (
     overlap_status,
     synchronisation_status,
 )
-from cvcdepth_ros.node.parameters import NodeParameters, read_parameters, unknown_qos_overrides
+from cvcdepth_ros.node.parameters import read_parameters, unknown_qos_overrides
 from cvcdepth_ros.node.publishers import SurroundOutputs
+from cvcdepth_ros.node.rig_transforms import RigTransforms
 from cvcdepth_ros.node.subscriptions import CameraInputs, StaticTransformInput
+from cvcdepth_ros.settings import NodeParameters
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
 from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet
 from cvcdepth_ros.surround_sets.synchronizer import SurroundSynchronizer
@@ -63,6 +67,9 @@ class SurroundSession:
         self._monitored_rig: Rig | None = None
         self._max_image_mb = parameters.max_image_mb
         self._offsets_ns = {camera.name: camera.stamp_offset_ns for camera in layout.cameras}
+        self._loss = TransportLoss()
+        self.transport_problem = ""
+        """Why images do not arrive that were sent; empty while they do."""
         self._progress = SetProgress(self._synchroniser.required, parameters.tolerance, parameters.max_age)
         self._is_finished = False
         with ExitStack() as opened:
@@ -70,9 +77,11 @@ class SurroundSession:
             if parameters.trace:
                 trace = opened.enter_context(closing(TraceFile(Path(parameters.trace).expanduser())))
             self.latencies = StageLatencies(trace)
+            self._ages = StampAges(self.latencies, self._ros_time)
             if any(camera.base_T_camera is None for camera in layout.cameras):
                 transforms = StaticTransformInput(node, assembler.transforms, self._on_transforms)
                 opened.enter_context(closing(transforms))
+            self._transforms = self._rig_transforms(opened) if parameters.publish_tf else None
             outputs = SurroundOutputs(node, layout.names, parameters.depth_encoding, self.latencies)
             self._outputs = opened.enter_context(closing(outputs))
             self._pipeline = SurroundPipeline(
@@ -93,11 +102,24 @@ class SurroundSession:
         for line in unknown_qos_overrides(node, self._inputs.image_topics):
             node.get_logger().warning(line)
 
+    def _rig_transforms(self, opened: ExitStack) -> RigTransforms | None:
+        """Return what publishes the rig file's poses; None where it has none, or tf2_msgs is not installed."""
+        if all(camera.base_T_camera is None for camera in self._assembler.layout.cameras):
+            return None
+        try:
+            return opened.enter_context(closing(RigTransforms(self._node, self._assembler)))
+        except ImportError:
+            self._node.get_logger().info("the rig file's poses are not on /tf_static: tf2_msgs is not installed")
+            return None
+
     def poll(self) -> None:
         """Subscribe image topics that have appeared, and follow how far the sets come. To be called regularly."""
         self._inputs.connect()
+        if self._transforms is not None:
+            self._transforms.poll()
         counts = {**asdict(self._mailbox.statistics()), **self._pipeline.counters}
         self._progress.update(self._synchroniser.statistics(), counts)
+        self.transport_problem = self._loss.update(self._inputs.lost)
 
     def set_model(self, estimator: DepthEstimator) -> None:
         """Use another network from the next set on; EngineError when it cannot run."""
@@ -149,6 +171,11 @@ class SurroundSession:
         return "; ".join(map(str, self._overlaps.findings())) if self._overlaps else ""
 
     @property
+    def unknown_latencies(self) -> list[str]:
+        """The stages whose latencies cannot be known, since images are not stamped in the node's time."""
+        return self._ages.unknown
+
+    @property
     def problem(self) -> str:
         """The reason why the last set was refused; empty when it was not."""
         return self._pipeline.problem
@@ -168,7 +195,9 @@ class SurroundSession:
         return [
             *cameras,
             synchronisation_status(statistics, mailbox, self._pipeline.counters, self.standstill(node_clock)),
-            inference_status(self.latencies.summaries(), mailbox, self.problem, self._estimator.model_id),
+            inference_status(
+                self.latencies.summaries(), mailbox, self.problem, self._estimator.model_id, self.unknown_latencies
+            ),
             model_status(self._estimator),
             *([overlap_status(self._overlaps)] if self._overlaps else []),
         ]
@@ -188,8 +217,7 @@ class SurroundSession:
         self._is_finished = self._pipeline.close()
 
     def _on_image(self, camera: str, message: Any) -> None:
-        taken = exposure_times(stamp_ns(message), self._offsets_ns[camera])
-        self.latencies.record("receive (ROS time)", (self._ros_time() - taken) / NANOSECONDS)
+        self._ages.record("receive (ROS time)", camera, exposure_times(stamp_ns(message), self._offsets_ns[camera]))
         megabytes = len(message.data) / 1e6
         if megabytes > self._max_image_mb:
             self._watches[camera].used(f"image of {megabytes:.1f} MB, more than max_image_mb ({self._max_image_mb:g})")
@@ -223,8 +251,8 @@ class SurroundSession:
         frame_ids = {name: self._assembler.frame_id(name) or "" for name in published.rig.names}
         limits = read_parameters(self._node).cloud_limits
         self._outputs.publish(published, frame_ids, limits)
-        age = self._ros_time() - max(published.surround_set.times_ns.values())
-        self.latencies.record("age of newest image at publish (ROS time)", age / 1e9)
+        newest = max(published.surround_set.times_ns.values())
+        self._ages.record("age of newest image at publish (ROS time)", "", newest)
 
     def _watch_overlaps(self, published: EstimatedSet[CameraImage]) -> None:
         if self._overlaps is None or self._monitored_rig is not published.rig:

@@ -12,7 +12,10 @@ from pydantic import ValidationError
 from cvcdepth_core.errors import RecordingError, RigError, first_validation_message
 from cvcdepth_core.rig.rig_file import CameraEntry, RigLayout
 from cvcdepth_ros.bags import Recording
-from cvcdepth_ros.messages.camera_discovery import CAMERA_INFO_TYPE, RECORDED_IMAGE_TYPES
+from cvcdepth_ros.messages.camera_discovery import (
+    CAMERA_INFO_TYPE,
+    RECORDED_IMAGE_TYPES,
+)
 from cvcdepth_ros.messages.recorded_cameras import find_recorded_cameras
 from cvcdepth_ros.messages.recorded_changes import find_calibration_changes
 from cvcdepth_ros.messages.rig_assembly import RigAssembler

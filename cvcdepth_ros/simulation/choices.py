@@ -14,10 +14,10 @@ from cvcdepth_core.errors import ConfigError, first_validation_message
 from cvcdepth_core.files import load_yaml
 from cvcdepth_core.rig.rig_file import RigLayout, load_rig_layout
 from cvcdepth_core.worlds.description import WorldSpec
-from cvcdepth_core.worlds.dice import Dice
-from cvcdepth_core.worlds.kinds import WorldKind
-from cvcdepth_core.worlds.random_rig import random_rig
-from cvcdepth_core.worlds.random_world import random_world
+from cvcdepth_core.worlds.generation.dice import Dice
+from cvcdepth_core.worlds.generation.kinds import WorldKind
+from cvcdepth_core.worlds.generation.random_rig import random_rig
+from cvcdepth_core.worlds.generation.random_world import random_world
 from cvcdepth_core.worlds.rig_size import complete_layout, layout_at_size
 from cvcdepth_core.worlds.sensors import CameraLook, Odometry, Sensors, random_look
 from cvcdepth_core.worlds.world_file import load_world

@@ -10,15 +10,16 @@ from typing import Any, NamedTuple
 
 from cvcdepth_core.errors import ConfigError, OutputError, RigError
 from cvcdepth_core.files import write_atomically
-from cvcdepth_core.worlds.dice import Dice
 from cvcdepth_core.worlds.drive import DriveSpec
+from cvcdepth_core.worlds.generation.dice import Dice
 from cvcdepth_core.worlds.sensors import Sensors
 from cvcdepth_core.worlds.shards import SUFFIX, PictureForm, write_shard
 from cvcdepth_ros.installation import package_version
-from cvcdepth_ros.simulation.choices import LookChoice, OdometryChoice, chosen_layout, chosen_sensors, chosen_world
+from cvcdepth_ros.simulation.choices import LookChoice, chosen_layout, chosen_sensors, chosen_world
 from cvcdepth_ros.simulation.workers import run_all
 
 _RECIPE = "recipe.json"
+_CAR_HEIGHT = 1.1  # metres: lower cameras are those of robots
 _ATTEMPTS = 8  # seeds that are tried for a drive: now and then a vehicle would start inside of something
 
 
@@ -35,7 +36,6 @@ class ManyDrives(NamedTuple):
     rate: float
     samples: int
     look: LookChoice
-    odometry: OdometryChoice
     body: str
     """none, car, van, robot; or varied: none for half of the drives."""
     stagger: float | None
@@ -107,10 +107,11 @@ def drive_spec(choices: ManyDrives, number: int, attempt: int = 0) -> DriveSpec:
     dice = Dice(choices.seed, number, attempt, 401)
     seed = dice.whole(0, 2**31 - 1)
     layout = chosen_layout(choices.rig, choices.size, seed)
-    sensors = chosen_sensors(len(layout.cameras), choices.look, choices.odometry, seed)
+    sensors = chosen_sensors(len(layout.cameras), choices.look, "exact", seed)
     body = choices.body
     if body == "varied":
-        body = dice.weighted({"none": 0.5, "car": 0.35, "van": 0.08, "robot": 0.07})
+        high = min(camera.base_T_camera[2, 3] for camera in layout.complete().cameras) > _CAR_HEIGHT
+        body = dice.weighted({"none": 0.5, "car": 0.4, "van": 0.1} if high else {"none": 0.6, "robot": 0.4})
     stagger = dice.between(0.0, 0.9) if choices.stagger is None else choices.stagger
     changes = {"rate": choices.rate, "stagger": stagger, "readout": choices.readout, "body": body, "lidar": None}
     return DriveSpec(

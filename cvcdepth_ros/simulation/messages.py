@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from cvcdepth_core.rig.calibration import Calibration
 from cvcdepth_core.rig.poses import Pose, quaternion_from_rotation
 from cvcdepth_core.stamps import NANOSECONDS
-from cvcdepth_core.worlds.lidar import Sweep
 from cvcdepth_core.worlds.odometry import Told
+from cvcdepth_core.worlds.rendering.lidar import Sweep
 from cvcdepth_ros.bags import typestore
 
 _COVARIANCE = np.zeros(36)

@@ -11,8 +11,8 @@ import numpy as np
 from cvcdepth_core.rig.rig_file import CameraEntry, RigLayout
 from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_core.worlds.drive import DriveSpec, SimulatedDrive
-from cvcdepth_core.worlds.lidar import lidar_mount
 from cvcdepth_core.worlds.odometry import Told
+from cvcdepth_core.worlds.rendering.lidar import lidar_mount
 from cvcdepth_ros.simulation.messages import (
     camera_info,
     compressed_image,

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -50,6 +51,8 @@ def run_all(
 
 
 def _start(prepare: Callable[[], None] | None) -> None:
+    # Ctrl-C reaches all processes of a terminal; the one that was called ends the others.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)
     if prepare is not None:
         prepare()

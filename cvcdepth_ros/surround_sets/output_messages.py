@@ -17,11 +17,13 @@ STRING_TYPE = "std_msgs/msg/String"
 
 MERGED_CLOUD = "points"
 MERGED_CAMERAS = "points/cameras"
-DEPTH, DEPTH_INFO, PICTURE, CLOUD = "depth/image_rect", "depth/camera_info", "image_rect", "points"
+DEPTH, DEPTH_INFO = "depth/image_rect", "depth/camera_info"
+PICTURE, PICTURE_INFO, CLOUD = "image_rect", "camera_info", "points"
 _CAMERA_TYPES = {
     DEPTH: IMAGE_TYPE,
     DEPTH_INFO: CAMERA_INFO_TYPE,
     PICTURE: IMAGE_TYPE,
+    PICTURE_INFO: CAMERA_INFO_TYPE,
     CLOUD: POINT_CLOUD_TYPE,
 }
 
@@ -43,8 +45,11 @@ def output_types(cameras: Sequence[str]) -> dict[str, str]:
 
 
 def camera_topics(camera: str) -> list[str]:
-    """Return the output topics, below the node's name, for which this camera's depth is needed."""
-    return [*(f"{camera}/{part}" for part in _CAMERA_TYPES), MERGED_CLOUD]
+    """Return the output topics, below the node's name, for which this camera's depth is needed.
+
+    What a merged cloud contains is known when it could be made.
+    """
+    return [*(f"{camera}/{part}" for part in _CAMERA_TYPES), MERGED_CLOUD, MERGED_CAMERAS]
 
 
 class SurroundMessages:
@@ -97,5 +102,6 @@ class SurroundMessages:
             DEPTH: lambda: self._factory.depth_image(stamp, frame_id, metres, self._encoding),
             DEPTH_INFO: lambda: self._factory.camera_info(stamp, frame_id, intrinsics, *metres.shape),
             PICTURE: lambda: self._factory.colour_image(stamp, frame_id, picture),
+            PICTURE_INFO: lambda: self._factory.camera_info(stamp, frame_id, intrinsics, *metres.shape),
             CLOUD: lambda: self._factory.point_cloud(stamp, frame_id, organised_cloud(result, index)),
         }

@@ -30,10 +30,12 @@ is known (two images) the decision waits for the next image instead, so only the
 
 **Faults.** Images may come late or out of order as long as nothing at or after their stamp has left their camera's
 queue. A camera's clock has stepped back (a recording that loops, NTP) when an image is older than its newest by more
-than `clock_jump`, or when three images in a row ascend behind the newest; then that camera's queue, and only that,
-starts anew. After a step forward the old anchor images find every camera beyond them and are decided at once. Every
-queue is bounded: a dead camera only means that the others drop their oldest image. Every image is counted as matched,
-queued or dropped for a reason.
+than `clock_jump` or five periods, or when three images in a row ascend behind the newest. Its images then wait until
+the other cameras' clocks have stepped back too, at most for two periods of those; the sets from before the step are
+decided, and the queues of the cameras that stepped, and only those, start anew: a recording that loops loses nothing.
+After a step forward the old anchor images find every camera beyond them and are decided at once. Every queue is
+bounded: a dead camera only means that the others drop their oldest image. Every image is counted as matched, queued or
+dropped for a reason.
 
 Choose an anchor that is not faster than the other cameras. Sets come in strictly increasing anchor time, and every
 camera's images too, except across a clock step or `flush`.
@@ -59,6 +61,8 @@ T = TypeVar("T")
 _DEFAULTS = MatchingSettings()
 _INTERVALS_FOR_PERIOD = 9
 _BEHIND_IN_A_ROW = 3
+_JUMP_PERIODS = 5
+_STEP_PERIODS = 2
 _PATIENCE_PERIODS = 3
 
 
@@ -165,12 +169,12 @@ class SurroundSynchronizer(Generic[T]):
         with self._lock:
             self._arrivals += 1
             stream.accept(exposure_times(stamp_ns, stream.offset), image, self._arrivals)
-            return self._decide(final=False)
+            return self._restart() if self._is_step_over() else self._decide(final=False)
 
     def flush(self) -> list[SurroundSet[T]]:
         """At the end of a recording: decide with what is queued, return the last sets, and start anew."""
         with self._lock:
-            sets = self._decide(final=True)
+            sets = self._restart() + self._decide(final=True)
             for stream in self._streams.values():
                 stream.clear("unmatched")
             return sets
@@ -179,6 +183,26 @@ class SurroundSynchronizer(Generic[T]):
         """Snapshot of the counters."""
         with self._lock:
             return SynchronizerStatistics(self._sets, {name: s.statistics() for name, s in self._streams.items()})
+
+    def _is_step_over(self) -> bool:
+        """Whether clocks have stepped back, and those that have not yet are not to be waited for."""
+        streams = self._streams.values()
+        stepped = [stream for stream in streams if stream.after_step]
+        others = [stream for stream in streams if not stream.after_step and stream.newest is not None]
+        awaited = [stream for stream in others if not any(_is_missing(stream, other) for other in streams)]
+        patience = _STEP_PERIODS * max((stream.period or 0 for stream in awaited), default=0)
+        return bool(stepped) and (not awaited or any(s.has_waited_after_step(patience) for s in stepped))
+
+    def _restart(self) -> list[SurroundSet[T]]:
+        """Go on in the time that the clocks have stepped back to, the sets of the former one decided."""
+        stepped = [stream for stream in self._streams.values() if stream.after_step]
+        sets: list[SurroundSet[T]] = []
+        if self._streams[self._acting_anchor].after_step:
+            sets = self._decide(final=True)
+            self._last_stamp = None
+        for stream in stepped:
+            stream.restart()
+        return sets + self._decide(final=False)
 
     def _decide(self, *, final: bool) -> list[SurroundSet[T]]:
         sets: list[SurroundSet[T]] = []
@@ -236,7 +260,7 @@ class SurroundSynchronizer(Generic[T]):
     def _may_belong_to_next(self, anchor: int, stamp: int | None) -> bool:
         """Whether the image may turn out nearer to an anchor image that has not come yet."""
         anchor_stream = self._streams[self._acting_anchor]
-        if stamp is None or stamp <= anchor or len(anchor_stream.stamps) > 1:
+        if stamp is None or stamp <= anchor or len(anchor_stream.stamps) > 1 or anchor_stream.after_step:
             return False
         return anchor_stream.period is None or _nearer_to_next(stamp, anchor, anchor + anchor_stream.period)
 
@@ -281,6 +305,8 @@ class _Stream(Generic[T]):
         self.newest: int | None = None  # latest stamp since the last clock step, whether still queued or not
         self.first: int | None = None  # the first one since then
         self.period: int | None = None
+        self.after_step: list[tuple[int, T, int]] = []
+        """Stamp, image and number of what has arrived since the clock stepped back, until the others' have too."""
         self._images: dict[int, T] = {}
         self._floor: int | None = None  # latest stamp that left the queue: nothing up to it can be used any more
         self._behind: list[int] = []  # the stamps that arrived last, while they ascend and are older than the newest
@@ -295,9 +321,26 @@ class _Stream(Generic[T]):
     def accept(self, stamp: int, image: T, arrival: int) -> None:
         """Queue the image, or count why not; `arrival` counts the images of all cameras."""
         self._received += 1
-        if self._steps_back(stamp):
-            self._clock_steps += 1
-            self.clear("clock_jump")
+        is_step = not self.after_step and self._steps_back(stamp)
+        self._clock_steps += is_step
+        if is_step or self.after_step:
+            self.after_step.append((stamp, image, arrival))
+        else:
+            self._queue(stamp, image, arrival)
+
+    def has_waited_after_step(self, patience: int) -> bool:
+        """Whether images have come for `patience` ns since the step, or there is no room for more."""
+        span = self.after_step[-1][0] - self.after_step[0][0]
+        return span >= patience or len(self.stamps) + len(self.after_step) >= self._queue_size
+
+    def restart(self) -> None:
+        """Drop what is left from before the step, and queue what has arrived since."""
+        self.clear("clock_jump")
+        arrived, self.after_step = self.after_step, []
+        for stamp, image, arrival in arrived:
+            self._queue(stamp, image, arrival)
+
+    def _queue(self, stamp: int, image: T, arrival: int) -> None:
         if stamp in self._images or stamp == self.newest:
             self._dropped["duplicate_stamp"] += 1
         elif self._floor is not None and stamp <= self._floor:
@@ -324,6 +367,8 @@ class _Stream(Generic[T]):
         """Whether an image still to come may be nearer to the anchor than the queued one of this stamp, if any."""
         if self.newest is None:
             return True
+        if self.after_step:  # where this clock alone has stepped, one of those may yet belong to the anchor
+            return stamp is None
         if self.newest >= anchor:
             return False
         if stamp is None or self.period is None:
@@ -369,7 +414,7 @@ class _Stream(Generic[T]):
 
     def statistics(self) -> CameraStatistics:
         dropped = {reason: count for reason, count in self._dropped.items() if count}
-        queued = len(self.stamps)
+        queued = len(self.stamps) + len(self.after_step)
         return CameraStatistics(
             received=self._received,
             matched=self._matched,
@@ -394,7 +439,8 @@ class _Stream(Generic[T]):
         if self._behind and stamp <= self._behind[-1]:
             self._behind.clear()
         self._behind.append(stamp)
-        return self.newest - stamp > self._clock_jump or len(self._behind) >= _BEHIND_IN_A_ROW
+        jump = self._clock_jump if self.period is None else min(self._clock_jump, _JUMP_PERIODS * self.period)
+        return self.newest - stamp > jump or len(self._behind) >= _BEHIND_IN_A_ROW
 
     def _observe(self, stamp: int) -> None:
         if self.newest is not None and stamp > self.newest:

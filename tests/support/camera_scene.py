@@ -45,6 +45,7 @@ class Cameras:
         self._info = {n: create(CameraInfo, f"/camera/{n}/camera_info", reliable()) for n in CAMERAS}
         self._cycle = 0
         self.sent: dict[str, set[int]] = {name: set() for name in CAMERAS}
+        self.newest_stamp = 0
         self.faults: dict[str, Callable[[Any], Any]] = {}
         """By camera: what becomes of its image; None is no image."""
 
@@ -60,7 +61,12 @@ class Cameras:
             self.publish_info(name)
             if image is not None:
                 self.sent[name].add(stamp_of(image))
+                self.newest_stamp = stamp_of(image)
                 self._images[name].publish(image)
+
+    def begin_again(self) -> None:
+        """Let the stamps go back to the first, as where a recording loops."""
+        self._cycle = 0
 
     def publish_info(self, name: str) -> None:
         self._info[name].publish(self.infos[name])

@@ -65,7 +65,7 @@ class NodeProcess:
     """A running surround_depth_node, used like a subprocess.Popen."""
 
     _forks = multiprocessing.get_context("forkserver")
-    _forks.set_forkserver_preload([NODE_MODULE])
+    _forks.set_forkserver_preload([NODE_MODULE, "cvcdepth_ros.node.surround_node"])
 
     def __init__(self, arguments: Sequence[str], environment: dict[str, str], log: Path) -> None:
         self._process = self._forks.Process(target=_run_node, args=(arguments, environment, log))

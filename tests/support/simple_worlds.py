@@ -9,11 +9,11 @@ from cvcdepth_core.rig.calibration import Calibration
 from cvcdepth_core.rig.rig_file import CameraEntry, PoseEntry, RigLayout
 from cvcdepth_core.worlds.description import Building, Drive, Ground, Motion, Road, Sky, Tree, Vehicle, Wave, WorldSpec
 from cvcdepth_core.worlds.drive import DriveSpec
-from cvcdepth_core.worlds.light import Lamps, Light
-from cvcdepth_core.worlds.materials import Layer, Material, MaterialTable
-from cvcdepth_core.worlds.meshes import Mesh, joined
-from cvcdepth_core.worlds.noise import Noise
+from cvcdepth_core.worlds.rendering.light import Lamps, Light
 from cvcdepth_core.worlds.sensors import Lidar, Sensors
+from cvcdepth_core.worlds.shapes.meshes import Mesh, joined
+from cvcdepth_core.worlds.surfaces.materials import Layer, Material, MaterialTable
+from cvcdepth_core.worlds.surfaces.noise import Noise
 from cvcdepth_core.worlds.world import Mover, World
 
 FORWARD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])

@@ -219,3 +219,39 @@ def test_a_reader_that_closes_the_pipe_early_sees_no_traceback(tmp_path: Path):
     command = shlex.join([*PROGRAM, "rig", str(SAMPLE), "-o", str(tmp_path / "rig.yaml"), "--json"])
     done = subprocess.run(["sh", "-c", f"{command} | true"], capture_output=True, text=True, check=False)
     assert done.stderr == ""
+
+
+def without(*modules: str) -> str:
+    """The beginning of a script that finds none of these modules."""
+    return f"import sys; sys.modules.update(dict.fromkeys({modules!r}))\n"
+
+
+@pytest.mark.parametrize(
+    ("call", "told"),
+    [
+        ("from cvcdepth_ros.bag_replay import main; sys.exit(main(['bench', *sys.argv[1:]]))", "cvcdepth: bench needs"),
+        (
+            "from cvcdepth_ros.demo.__main__ import main; sys.exit(main(['--recording', *sys.argv[1:]]))",
+            "demo: the demo",
+        ),
+    ],
+)
+def test_what_drives_a_node_says_without_ros_what_is_missing_in_one_line(call: str, told: str):
+    words = [sys.executable, "-c", without("rclpy") + call, str(SAMPLE), "--untrained", "--height", "64"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    *_, line = done.stderr.splitlines()
+    assert line.startswith(told)
+    assert "pip install 'cvcdepth_ros[ros-jazzy]'" in line
+
+
+def test_the_nodes_help_is_there_without_ros_and_running_it_says_what_is_missing_in_one_line():
+    script = without("rclpy") + "from cvcdepth_ros.surround_depth_node import main; main()"
+    shown = subprocess.run([sys.executable, "-c", script, "--help"], capture_output=True, text=True, check=True)
+    assert "usage: surround_depth_node" in shown.stdout
+    assert "  min_cameras      Cameras without which no set is made" in shown.stdout
+    refused = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert refused.returncode == 1
+    (line,) = refused.stderr.splitlines()
+    assert "needs ROS 2, but" in line
+    assert "extra ros-jazzy" in line

@@ -8,7 +8,7 @@ asserted to be what method.md says it is.
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -436,8 +436,8 @@ def test_d_a_sample_without_overlap_does_not_change_the_others(golden_dir):
 
 
 def test_d_skipping_the_alignment_of_the_whole_batch_gives_the_released_value(golden_dir, monkeypatch):
-    def align_all_or_none(warped, warp_mask, target, target_mask, masked_deviation):
-        aligned = align_intensity(warped, warp_mask, target, target_mask, masked_deviation)
+    def align_all_or_none(warped, warp_mask, target, target_mask, masked_deviation, **whole: Any):
+        aligned = align_intensity(warped, warp_mask, target, target_mask, masked_deviation, **whole)
         overlaps = ((warp_mask * target_mask) > 0).any(dim=-1, keepdim=True).any(dim=-2, keepdim=True)
         return torch.where(overlaps.all(dim=0), aligned, warped)
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from repository import ROOT
 
 LAUNCH_FILE = ROOT / "launch" / "surround_depth.launch.py"
@@ -81,12 +82,41 @@ def test_rig_and_checkpoint_have_precedence_over_the_parameter_file(generate):
     assert "use_sim_time" not in given
 
 
+def test_frame_and_cameras_are_parameters_of_their_types(generate):
+    (_, given) = start(generate, base_frame="007", min_cameras="4").options["parameters"]
+    assert (given["base_frame"].arguments, given["base_frame"].options) == (("007",), {"value_type": str})
+    (substitution,) = given["min_cameras"].arguments
+    assert substitution.perform({"min_cameras": "4"}) == "4"
+    assert given["min_cameras"].options == {"value_type": int}
+
+
+def test_log_level_and_remappings_are_the_nodes(generate):
+    node = start(generate, log_level="debug", remap="/camera/front/image:=/front/image  camera_info:=info")
+    assert node.options["ros_arguments"] == ["--log-level", "debug"]
+    assert node.options["remappings"] == [("/camera/front/image", "/front/image"), ("camera_info", "info")]
+    assert start(generate).options["remappings"] == start(generate).options["ros_arguments"] == []
+
+
+def test_a_remapping_that_is_none_is_named(generate):
+    with pytest.raises(ValueError, match="expected FROM:=TO, found '/camera/front'"):
+        start(generate, remap="a:=b /camera/front")
+
+
 def test_simulated_time_is_asked_for_as_a_boolean(generate):
     (_, given) = start(generate, use_sim_time="true").options["parameters"]
     assert given["use_sim_time"].options == {"value_type": bool}
 
 
+def test_an_argument_that_is_a_parameter_is_one_of_the_nodes_and_has_its_default_in_the_file(generate):
+    stated = yaml.safe_load((ROOT / "config" / "surround_depth.yaml").read_text())["/**"]["ros__parameters"]
+    (_, given) = start(generate, rig="a", checkpoint="b", base_frame="c", min_cameras="1", use_sim_time="true").options[
+        "parameters"
+    ]
+    assert given.keys() - {"use_sim_time"} <= stated.keys()
+
+
 def test_every_argument_says_what_it_is_for(generate):
     declared = [e for e in generate().arguments[0] if type(e).__name__ == "DeclareLaunchArgument"]
-    assert {e.arguments[0] for e in declared} == {"rig", "checkpoint", "params_file", "namespace", "use_sim_time"}
+    names = {"rig", "checkpoint", "params_file", "namespace", "use_sim_time", "base_frame", "min_cameras"}
+    assert {e.arguments[0] for e in declared} == names | {"log_level", "remap"}
     assert all(e.options["description"] for e in declared)

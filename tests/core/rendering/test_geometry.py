@@ -10,6 +10,7 @@ from torch import Tensor
 
 from cvcdepth_core.rendering.projection import (
     PROJECTION_EPSILON,
+    Reprojection,
     axis_angle_to_rotation,
     back_project,
     project,
@@ -19,7 +20,15 @@ from cvcdepth_core.rendering.projection import (
     rotation_to_euler_xyz,
     transform,
 )
-from cvcdepth_core.rendering.view_synthesis import align_intensity, sample, splat_depth, warp_views
+from cvcdepth_core.rendering.view_synthesis import (
+    BlackBeyond,
+    KnownView,
+    align_intensity,
+    sample,
+    splat_depth,
+    warp_by_depth,
+    warp_views,
+)
 from cvcdepth_core.training.augmentation import mirror_motion
 from cvcdepth_core.training.motion import (
     distribute_anchor_motion,
@@ -214,6 +223,50 @@ def test_points_behind_the_camera_are_seen_only_by_the_published_validity():
     seen = [warp_views(behind, images, masks, EYE, K, in_front_only=only).masks.sum() for only in (False, True)]
     assert seen[0] > 0
     assert seen[1] == 0
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=SEEDS, first=st.integers(0, 3))
+def test_views_by_depth_are_those_by_points_with_the_same_gradients(seed, first):
+    torch.manual_seed(seed)
+    images, masks = torch.rand(2, 3, 3, 6, 9, dtype=FLOAT64), torch.rand(2, 3, 1, 6, 9, dtype=FLOAT64)
+    K = torch.tensor([[5.0, 0.3, 4], [0, 5, 2.5], [0, 0, 1]], dtype=FLOAT64)
+    depth = (2 + torch.rand(2, 1, 1, 6, 9, dtype=FLOAT64)).requires_grad_()
+    source_T_target = (random_poses(seed, 2, 3) * 0.05 + EYE * 0.95).requires_grad_()
+    points = back_project(depth, K.inverse()).unflatten(-1, (6, 9))[..., first:].flatten(-2)
+    homogeneous = (K @ transform(source_T_target, points)).unflatten(-1, (6, -1))
+    in_order = homogeneous[..., :2, :, :] / (homogeneous[..., 2:, :, :] + PROJECTION_EPSILON)
+    grid = (2 * in_order / torch.tensor([8.0, 5.0], dtype=FLOAT64)[:, None, None] - 1).movedim(-3, -1)
+    by_points = sample(images, grid)
+    way = Reprojection.from_cameras(K.inverse(), source_T_target, K).from_column(torch.tensor(float(first)))
+    by_depth = warp_by_depth(depth[..., first:], images, masks, way, in_front_only=True)
+    torch.testing.assert_close(by_depth.images, by_points)
+    torch.testing.assert_close(by_depth.grid, grid)
+    weights = torch.rand_like(by_points)
+    for ours, theirs in zip(
+        torch.autograd.grad((by_depth.images * weights).sum(), (depth, source_T_target)),
+        torch.autograd.grad((by_points * weights).sum(), (depth, source_T_target)),
+        strict=True,
+    ):
+        torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-9)
+
+
+def test_a_part_of_a_view_is_aligned_as_the_whole_is():
+    warped, target = torch.rand(2, 3, 6, 20, dtype=FLOAT64), torch.rand(2, 3, 6, 20, dtype=FLOAT64)
+    masks = torch.rand(2, 1, 6, 20, dtype=FLOAT64)
+    warped[..., :12], masks[..., :12] = 0, 0
+    whole = align_intensity(warped, masks, target, torch.ones_like(masks), masked_deviation=False)
+    part = align_intensity(
+        warped[..., 12:],
+        masks[..., 12:],
+        target[..., 12:],
+        torch.ones_like(masks[..., 12:]),
+        masked_deviation=False,
+        whole_warped=BlackBeyond(8 / 20),
+        whole_target=KnownView.from_images(target),
+    )
+    torch.testing.assert_close(part, whole[..., 12:])
+    assert not whole[..., :12].any()
 
 
 def test_alignment_gives_a_view_the_brightness_of_its_target_and_leaves_one_without_overlap_alone():

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812
 
-from cvcdepth_core.rendering.photometric import masked_mean, photometric_error, ssim_distance
+from cvcdepth_core.rendering.photometric import TargetStatistics, masked_mean, photometric_error, ssim_distance
 from cvcdepth_core.rendering.projection import axis_angle_to_rotation, rigid
 from cvcdepth_core.training.losses import pose_consistency, smoothness
 
@@ -55,14 +55,21 @@ def test_one_target_serves_several_predictions_and_collects_their_gradients():
     torch.testing.assert_close(t.grad, expanded.grad.sum(dim=1, keepdim=True))
 
 
-def test_views_that_do_not_fit_one_chunk_are_all_computed(monkeypatch):
-    p, t = images(7, 3, 8, 9).requires_grad_(), images(7, 3, 8, 9, seed=1)
+@pytest.mark.parametrize("planes", [1, 2, 3, 6])
+def test_views_that_do_not_fit_one_chunk_are_all_computed(monkeypatch, planes):
+    p, t = images(2, 7, 3, 8, 9).requires_grad_(), images(1, 7, 3, 8, 9, seed=1).requires_grad_()
     whole = photometric_error(p, t)
-    gradient = torch.autograd.grad(whole.sum(), p)
-    monkeypatch.setattr("cvcdepth_core.rendering.photometric._CHUNK_ELEMENTS", 2 * 3 * 8 * 9)
+    gradients = torch.autograd.grad(whole.square().sum(), (p, t))
+    monkeypatch.setattr("cvcdepth_core.rendering.photometric._CHUNK_ELEMENTS", planes * 8 * 9)
     chunked = photometric_error(p, t)
     torch.testing.assert_close(chunked, whole)
-    torch.testing.assert_close(torch.autograd.grad(chunked.sum(), p), gradient)
+    torch.testing.assert_close(torch.autograd.grad(chunked.square().sum(), (p, t)), gradients)
+
+
+def test_statistics_of_targets_serve_several_calls():
+    p, t = images(2, 4, 3, 8, 9), images(1, 4, 3, 8, 9, seed=1)
+    measured = TargetStatistics.from_images(t)
+    assert torch.equal(photometric_error(p, t, measured), photometric_error(p, t))
 
 
 def test_equal_images_have_no_photometric_error_and_no_gradient():

@@ -17,6 +17,7 @@ from torch.nn import functional as F  # noqa: N812
 from cvcdepth_core.errors import ImageError, RigError
 from cvcdepth_core.networks import DepthNet, PoseNet, RigImages
 from cvcdepth_core.rendering.projection import back_project, rigid
+from cvcdepth_core.rendering.strips import Strips
 from cvcdepth_core.rendering.view_synthesis import sample, sampling_grid
 from cvcdepth_core.training.augmentation import mirror_rig
 from cvcdepth_core.training.batch import RigBatch
@@ -92,6 +93,29 @@ def test_the_order_of_the_cameras_does_not_matter():
     torch.testing.assert_close(value.loss, other.loss, rtol=1e-12, atol=0)
     for name, term in value.terms.items():
         torch.testing.assert_close(term[:, order], other.terms[name], rtol=1e-10, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    "variant", [{}, {"corrected": True}, {"depth_warping": "dcl"}, {"reconstruction_consistency": 0, "spatial": 0}]
+)
+@pytest.mark.parametrize("cameras", [5, 6])
+def test_the_overlap_alone_gives_the_loss_and_gradients_of_whole_images(monkeypatch, cameras, variant):
+    batch = random_batch(samples=2, cameras=cameras, height=32, width=160)
+    batch.intrinsics[..., 0, 0] *= 1.6  # less overlap
+    prediction, noise = random_prediction(batch), noise_for(batch)
+    config = ObjectiveConfig(pose_consistency=0.1, **variant)
+
+    def evaluated() -> tuple[Tensor, Tensor]:
+        value = evaluate_objective(batch, prediction, config, noise)
+        return value.per_sample, torch.autograd.grad(value.loss, prediction.disparity, retain_graph=True)[0]
+
+    in_strips = evaluated()
+    width = synthesise_views(batch, prediction, config).overlap.strips.width
+    monkeypatch.setattr(Strips, "from_intervals", lambda seen, *sizes: Strips.from_whole_images(*sizes))
+    assert width < 160
+    assert synthesise_views(batch, prediction, config).overlap.strips.width == 160
+    for ours, whole in zip(in_strips, evaluated(), strict=True):
+        torch.testing.assert_close(ours, whole, rtol=1e-10, atol=1e-13)
 
 
 def test_where_two_neighbours_see_a_pixel_the_correction_averages_and_the_release_adds():

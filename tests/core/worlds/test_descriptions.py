@@ -25,10 +25,10 @@ from cvcdepth_core.worlds.description import (
     VehicleKind,
     WorldSpec,
 )
-from cvcdepth_core.worlds.kinds import WorldKind
-from cvcdepth_core.worlds.lenses import Lens
-from cvcdepth_core.worlds.random_rig import random_rig
-from cvcdepth_core.worlds.random_world import random_world
+from cvcdepth_core.worlds.generation.kinds import WorldKind
+from cvcdepth_core.worlds.generation.random_rig import random_rig
+from cvcdepth_core.worlds.generation.random_world import random_world
+from cvcdepth_core.worlds.rendering.lenses import Lens
 from cvcdepth_core.worlds.rig_size import complete_layout, layout_at_size
 from cvcdepth_core.worlds.world_file import load_world, save_world
 

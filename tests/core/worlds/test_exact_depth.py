@@ -7,10 +7,10 @@ from simple_worlds import FORWARD, LENSES, Standing, simple_world, textured
 
 from cvcdepth_core.errors import RigError
 from cvcdepth_core.rig.calibration import Calibration
-from cvcdepth_core.worlds.lenses import Lens
-from cvcdepth_core.worlds.materials import MaterialTable
-from cvcdepth_core.worlds.meshes import box, flat_mesh, sphere
-from cvcdepth_core.worlds.renderer import Renderer
+from cvcdepth_core.worlds.rendering.lenses import Lens
+from cvcdepth_core.worlds.rendering.renderer import Renderer
+from cvcdepth_core.worlds.shapes.meshes import box, flat_mesh, sphere
+from cvcdepth_core.worlds.surfaces.materials import MaterialTable
 from cvcdepth_core.worlds.world import Mover
 
 pytest.importorskip("embreex", reason="worlds need embreex")

@@ -7,18 +7,18 @@ from simple_worlds import FORWARD, LENSES, Standing, daylight, short_drive, simp
 
 from cvcdepth_core.errors import ConfigError
 from cvcdepth_core.worlds.building import build_world
-from cvcdepth_core.worlds.camera_response import daylight_of, develop
 from cvcdepth_core.worlds.description import Building, Drive, Sky, WorldSpec
-from cvcdepth_core.worlds.dice import Dice
 from cvcdepth_core.worlds.drive import DriveSpec, SimulatedDrive
-from cvcdepth_core.worlds.lenses import Lens
-from cvcdepth_core.worlds.materials import FacadeParameters, Layer, Material, MaterialTable, Pattern, evaluate
-from cvcdepth_core.worlds.meshes import box, cylinder, extruded, face_normals, prism, sphere
-from cvcdepth_core.worlds.noise import Noise, noise
-from cvcdepth_core.worlds.random_world import random_world
-from cvcdepth_core.worlds.renderer import Renderer
+from cvcdepth_core.worlds.generation.dice import Dice
+from cvcdepth_core.worlds.generation.random_world import random_world
+from cvcdepth_core.worlds.rendering.camera_response import daylight_of, develop
+from cvcdepth_core.worlds.rendering.lenses import Lens
+from cvcdepth_core.worlds.rendering.renderer import Renderer
 from cvcdepth_core.worlds.sensors import CameraLook, Sensors, random_look
+from cvcdepth_core.worlds.shapes.meshes import box, cylinder, extruded, face_normals, prism, sphere
 from cvcdepth_core.worlds.site import Site
+from cvcdepth_core.worlds.surfaces.materials import FacadeParameters, Layer, Material, MaterialTable, Pattern, evaluate
+from cvcdepth_core.worlds.surfaces.noise import Noise, noise
 
 pytest.importorskip("embreex", reason="worlds need embreex")
 
@@ -80,9 +80,6 @@ def test_solids_are_not_inside_out():
         middles = mesh.vertices[mesh.faces].mean(axis=1) - mesh.vertices.mean(axis=0)
         outward = (face_normals(mesh.vertices, mesh.faces) * middles).sum(axis=1)
         assert (outward > 0).all()
-    mirrored = extruded(profile, 1.5, 0).mirrored()
-    middles = mirrored.vertices[mirrored.faces].mean(axis=1) - mirrored.vertices.mean(axis=0)
-    assert ((face_normals(mirrored.vertices, mirrored.faces) * middles).sum(axis=1) > 0).all()
 
 
 def test_colours_stay_within_what_surfaces_can_be():
@@ -145,6 +142,14 @@ def test_a_vehicle_that_starts_inside_a_wall_is_refused_by_name():
     spec = DriveSpec(layout=two_cameras(), world=world)
     with pytest.raises(ConfigError, match=r"the vehicle starts inside of something: building at x 0\.0, y 0\.0"):
         SimulatedDrive(spec)
+
+
+def test_a_body_that_would_hide_a_low_camera_is_refused():
+    low = two_cameras()
+    mounts = [camera.base_T_camera for camera in low.complete().cameras]
+    mounts[1][2, 3] = 0.4
+    with pytest.raises(ConfigError, match=r"body car: a camera 0\.40 m above the ground would be inside of it"):
+        build_world(street_spec(), "car", mounts)
 
 
 @pytest.mark.parametrize("body", ["car", "van", "robot"])

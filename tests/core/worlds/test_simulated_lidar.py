@@ -6,12 +6,12 @@ import pytest
 from simple_worlds import FORWARD, LENSES, Standing, simple_world, textured
 
 from cvcdepth_core.rig.poses import inverse
-from cvcdepth_core.worlds.lenses import Lens
-from cvcdepth_core.worlds.lidar import lidar_mount, sweep
-from cvcdepth_core.worlds.materials import MaterialTable
-from cvcdepth_core.worlds.meshes import box, flat_mesh
-from cvcdepth_core.worlds.renderer import Renderer
+from cvcdepth_core.worlds.rendering.lenses import Lens
+from cvcdepth_core.worlds.rendering.lidar import lidar_mount, sweep
+from cvcdepth_core.worlds.rendering.renderer import Renderer
 from cvcdepth_core.worlds.sensors import Lidar
+from cvcdepth_core.worlds.shapes.meshes import box, flat_mesh
+from cvcdepth_core.worlds.surfaces.materials import MaterialTable
 
 pytest.importorskip("embreex", reason="worlds need embreex")
 

@@ -54,5 +54,12 @@ def test_depth_images_and_cameras_without_images_are_no_cameras():
     assert [camera.name for camera in discover_cameras(found)] == ["cam"]
 
 
+def test_what_a_node_puts_out_is_no_camera_beside_the_cameras():
+    outputs = topics("/surround_depth/cam", image_rect=RAW) | topics("/surround_depth/cam/depth", image_rect=RAW)
+    assert discover_cameras(outputs) == []
+    cameras = topics("/cam", image_raw=RAW) | topics("/cam/depth", image_rect=RAW) | topics("/rect", image_rect=RAW)
+    assert [camera.name for camera in discover_cameras(outputs | cameras)] == ["cam", "rect"]
+
+
 def test_no_topics_are_no_cameras():
     assert discover_cameras({}) == []

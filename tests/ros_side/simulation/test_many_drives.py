@@ -15,7 +15,7 @@ pytest.importorskip("embreex", reason="worlds need embreex")
 
 CHOICES = ManyDrives(
     drives=2, rig="random", world="rural", size=(48, 32), seed=4, seconds=0.2, rate=10.0, samples=1, look="varied",
-    odometry="exact", body="varied", stagger=None, readout=0.0, images="png", quality=90,
+    body="varied", stagger=None, readout=0.0, images="png", quality=90,
 )  # fmt: skip
 
 

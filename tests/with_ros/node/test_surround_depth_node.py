@@ -543,10 +543,10 @@ def test_full_size_raw_images_at_ten_hertz_are_not_lost(graph, messages, rig_con
         return all(message_of(graph, f"camera {name}") == "waiting for images: no image yet" for name in CAMERAS)
 
     graph.spin_until(calibrated, "every calibration")
-    start = time.monotonic()
+    start, now = time.monotonic(), time.time_ns()
     for index in range(sets):
         for offset, name in enumerate(FIRING_ORDER):
-            nanoseconds = 10**18 + index * 10**8 + offset * 16 * 10**6
+            nanoseconds = now + index * 10**8 + offset * 16 * 10**6
             for message in (infos[name], images[name]):
                 message.header.stamp.sec, message.header.stamp.nanosec = divmod(nanoseconds, 10**9)
                 message.header.frame_id = f"{name}_camera_optical_frame"
@@ -564,7 +564,7 @@ def test_full_size_raw_images_at_ten_hertz_are_not_lost(graph, messages, rig_con
 
 
 def test_the_parameter_file_lists_every_parameter_with_its_default(graph):
-    from cvcdepth_ros.node.parameters import NodeParameters
+    from cvcdepth_ros.settings import NodeParameters
 
     content = yaml.safe_load((ROOT / "config" / "surround_depth.yaml").read_text())["/**"]["ros__parameters"]
     defaults = {name: field.default for name, field in NodeParameters.model_fields.items()}

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the vehicle goes, told by its cameras alone: alignment from set to set, chained."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from cvcdepth_core.refinement.alignment import AlignedMotion, AlignedSet, Twist, align
+from cvcdepth_core.refinement.moments import SurroundMoment, reduced_depth
+from cvcdepth_core.rig.poses import Pose
+
+_LONGEST_GAP = 1.0  # seconds between two sets that are aligned
+
+
+@dataclass(frozen=True, eq=False)
+class _Last:
+    """The set before."""
+
+    aligned: AlignedSet
+    """With refined depth, where there is any."""
+    reference_time: float
+    world_T_base: Pose
+    """At the reference time."""
+    twist: Twist | None
+
+
+class VisualOdometry:
+    """Chains aligned motions; the world is the base frame at some set, and another one after every gap.
+
+    For every set call `track`, then `keep` with the depth that was made of it. Depth refined before makes the motion of
+    the next set more exact; its scale is that of the network's depth.
+    """
+
+    def __init__(self, max_width: int = 160) -> None:
+        """Align on grids of at most so many columns."""
+        self._max_width = max_width
+        self._last: _Last | None = None
+        self._now: tuple[AlignedSet, Pose, AlignedMotion | None] | None = None
+
+    def reset(self) -> None:
+        """Forget the set before: after a jump in time, or when the rig has changed."""
+        self._last = self._now = None
+
+    def track(self, moment: SurroundMoment, guess: Twist | None = None) -> AlignedMotion | None:
+        """Return the motion since the set before; None for the first set and after a gap.
+
+        `guess` is where the search begins beside standstill and the motion before: a pose network's answer, say.
+        """
+        now = AlignedSet.of(moment, self._max_width)
+        last = self._last
+        if last is None or not 0 < float(now.times.mean()) - last.reference_time <= _LONGEST_GAP:
+            self._now = now, np.eye(4), None
+            return None
+        starts = [start for start in (last.twist, guess) if start is not None]
+        motion = align(now, last.aligned, starts)
+        here = last.world_T_base @ motion.pose(float(now.times.mean()) - last.reference_time)
+        self._now = now, here if motion.problem is None else np.eye(4), motion
+        return motion
+
+    def base_poses(self) -> NDArray[np.float64] | None:
+        """Return world_T_base [N, 4, 4] at each exposure of the set last tracked; None while it is not known."""
+        if self._now is None:
+            return None
+        now, here, motion = self._now
+        if motion is None or motion.problem is not None:
+            return None
+        reference = float(now.times.mean())
+        return np.stack([here @ motion.pose(float(time) - reference) for time in now.times])
+
+    def keep(self, depth: NDArray[np.float32]) -> None:
+        """Let the next set align to the one last tracked, with this `depth` [N, H, W] (NaN where not trusted)."""
+        if self._now is None:
+            return
+        now, here, motion = self._now
+        aligned = now._replace(depth=reduced_depth(torch.from_numpy(depth), depth.shape[2] // now.depth.shape[2]))
+        twist = motion.twist if motion is not None and motion.problem is None else None
+        self._last = _Last(aligned, float(now.times.mean()), here, twist)

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Worlds and rigs thought up from a seed."""
