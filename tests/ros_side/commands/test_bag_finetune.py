@@ -513,6 +513,6 @@ def test_a_configuration_for_a_data_set_is_refused_at_once_in_one_line_with_the_
     nowhere = ("--from", tmp_path / "gone.safetensors", "--rig", tmp_path / "gone.yaml")
     assert finetune(path, tmp_path / "run", *nowhere, bags=(tmp_path / "gone.mcap",)) == 1
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(f"bag_replay: {path}: dataset is 'ddad', for which there is no reader yet")
+    assert line.startswith(f"cvcdepth: {path}: dataset is 'ddad', for which there is no reader yet")
     assert line.endswith(f"write `dataset: recording` in this file, or in a new one below `base: {path}`")
     assert not (tmp_path / "run").exists()
