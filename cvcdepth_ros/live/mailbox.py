@@ -52,6 +52,7 @@ class Mailbox(Generic[T]):
         self._statistics = MailboxStatistics()
         self._stale_age: float | None = None
         self._last_time = 0
+        self._was_fresh = False
         self._now_at_jump: int | None = None
         self._changed = threading.Condition()
 
@@ -90,8 +91,7 @@ class Mailbox(Generic[T]):
         while (surround_set := self._take(deadline)) is not None:
             now = self._clock()
             age = now - surround_set.time_ns
-            is_jump = self._jumps(surround_set.time_ns, now)
-            fresh = self._max_age is None or age <= self._max_age or is_jump
+            fresh = self._max_age is None or self._is_fresh(surround_set.time_ns, now, self._max_age)
             with self._changed:
                 self._count("delivered" if fresh else "stale")
                 if not fresh:
@@ -114,12 +114,13 @@ class Mailbox(Generic[T]):
         with self._changed:
             return self._statistics
 
-    def _jumps(self, time_ns: int, now: int) -> bool:
-        """Whether the sets' time has gone back, as where a recording loops, and the clock is still to follow."""
-        if time_ns < self._last_time and self._max_age is not None and self._last_time - time_ns > self._max_age:
+    def _is_fresh(self, time_ns: int, now: int, max_age: int) -> bool:
+        """Whether a set is young enough, or its time has gone back and the clock of fresh sets is still to follow."""
+        if self._was_fresh and self._last_time - time_ns > max_age:
             self._now_at_jump = now
-        self._last_time = time_ns
-        return self._now_at_jump is not None and 0 <= now - self._now_at_jump < _JUMP_NS
+        is_jump = self._now_at_jump is not None and 0 <= now - self._now_at_jump < _JUMP_NS
+        self._last_time, self._was_fresh = time_ns, now - time_ns <= max_age
+        return self._was_fresh or is_jump
 
     def _take(self, deadline: float | None) -> SurroundSet[T] | None:
         with self._changed:

@@ -24,14 +24,13 @@ class ProblemLog:
     def __init__(self, logger: Any) -> None:
         """Write with an rclpy logger."""
         self._logger = logger
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew: what comes next may be other cameras, and what was wrong is neither there nor mended."""
         self._standing = StandingProblems()
         self._reported: dict[str, CameraCondition] = {}
         self._were_healthy: set[str] = set()
-
-    def forget_cameras(self) -> None:
-        """Begin anew: the cameras that come next may be others."""
-        self._reported = {}
-        self._were_healthy = set()
 
     def tell(self, problems: Mapping[str, str], conditions: Mapping[str, CameraCondition], is_matching: bool) -> None:
         """Log what is due of the problems, by subject, and of the cameras' conditions.

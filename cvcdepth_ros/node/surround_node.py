@@ -94,7 +94,7 @@ class SurroundDepthNode(ManagedNode):
             self._discovery = None
         session, self._session = self._session, None
         self._is_idleness_told = False
-        self._problem_log.forget_cameras()
+        self._problem_log.forget()
         if session is None:
             return True
         for stage, summary in session.latencies.summaries().items():

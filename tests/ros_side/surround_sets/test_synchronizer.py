@@ -575,6 +575,35 @@ def test_a_set_older_than_the_freshness_gate_is_dropped_when_it_is_read():
     assert (mailbox.statistics().delivered, mailbox.statistics().stale) == (1, 1)
 
 
+def taken(mailbox: Mailbox[str], sequence: int, time_ns: int) -> bool:
+    mailbox.put(numbered_set(sequence, time_ns=time_ns))
+    return mailbox.get(timeout=0) is not None
+
+
+def test_where_a_recording_loops_sets_of_the_new_round_are_taken_before_the_clock_has_gone_back():
+    now = [10_000 * MS]
+    mailbox: Mailbox[str] = Mailbox(max_age=0.5, clock=lambda: now[0])
+    assert taken(mailbox, 0, 9_900 * MS)
+    assert taken(mailbox, 1, 0)  # the clock has not followed
+    assert taken(mailbox, 2, 100 * MS)
+    now[0] = 200 * MS
+    assert taken(mailbox, 3, 150 * MS)
+    now[0] = 1_000 * MS
+    assert not taken(mailbox, 4, 200 * MS)
+
+
+def test_a_clock_that_does_not_follow_the_jump_or_never_was_the_recordings_makes_no_set_fresh():
+    now = [10_000 * MS]
+    mailbox: Mailbox[str] = Mailbox(max_age=0.5, clock=lambda: now[0])
+    assert taken(mailbox, 0, 9_900 * MS)
+    assert taken(mailbox, 1, 0)
+    now[0] += 1_000 * MS
+    assert not taken(mailbox, 2, 1_000 * MS)
+    years = 10**18
+    mailbox = Mailbox(max_age=0.5, clock=lambda: years)
+    assert not any(taken(mailbox, i, time_ns * MS) for i, time_ns in enumerate((9_900, 0, 100, 200)))
+
+
 def test_a_put_wakes_a_waiting_reader():
     mailbox: Mailbox[str] = Mailbox()
     answers: list[object] = []
