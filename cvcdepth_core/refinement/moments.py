@@ -109,8 +109,15 @@ def to_grid(moment: SurroundMoment, max_width: int, device: torch.device | str =
 
 
 def reduced(images: Tensor, reduction: int) -> Tensor:
-    """Average `images` [N, H, W] over squares of `reduction` pixels; NaN where any of them is."""
-    return images if reduction == 1 else F.avg_pool2d(images.unsqueeze(1), reduction).squeeze(1)
+    """Average `images` [N, H, W] over squares of `reduction` pixels, a power of two; NaN where any of them is.
+
+    What does not fill a square at the right or lower border is left out.
+    """
+    while reduction > 1:
+        rows = images[:, :-1:2] + images[:, 1::2]
+        images = (rows[:, :, :-1:2] + rows[:, :, 1::2]) / 4
+        reduction //= 2
+    return images
 
 
 def reduced_depth(depth: Tensor, reduction: int) -> Tensor:
