@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 import statistics
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -88,6 +88,8 @@ class Recorded(NamedTuple):
         return list(range(len(self.sets) * 3 // 4, len(self.sets)))
 
 
+Standing = Mapping[int, Sequence[NDArray[np.bool_]]]
+"""By the number of a set: of each camera's truth [M] whether it stands still."""
 Result = list[tuple[int, RefinedDepth, float]]
 """Number of each set, what became of it, and CPU milliseconds."""
 
@@ -103,7 +105,7 @@ def main() -> None:
     if options.fit_confidence:
         print_confidence_maps(recorded, mounts)
         return
-    still = [standing_points(recorded.sets, number) for number in range(len(recorded.sets))]
+    still = {number: standing_points(recorded.sets, number) for number in recorded.held_out}
     print_scores(recorded, mounts, still, options)
 
 
@@ -337,7 +339,7 @@ class Scores(NamedTuple):
     calibration: float
 
 
-def scored(recorded: Recorded, still: Sequence[Sequence[NDArray[np.bool_]]], result: Result, of_prior: bool) -> Scores:
+def scored(recorded: Recorded, still: Standing, result: Result, of_prior: bool) -> Scores:
     """Score refined depth and its confidence, or the depth before with the confidence it then has."""
     rows, table = [], CalibrationTable.empty()
     for number, refined, _ in result:
@@ -416,9 +418,7 @@ def trials(options: argparse.Namespace, mounts: RefinedMounts) -> Iterator[tuple
         yield f"{shown}, pose network, refined mounts", grid, "network", mounts.base_T_camera
 
 
-def print_scores(
-    recorded: Recorded, mounts: RefinedMounts, still: Sequence[Sequence[NDArray[np.bool_]]], options: argparse.Namespace
-) -> None:
+def print_scores(recorded: Recorded, mounts: RefinedMounts, still: Standing, options: argparse.Namespace) -> None:
     """Print a row for the depth as it is and for every trial."""
     cameras, ranges = " | ".join(recorded.rig.names), " | ".join(f"{a:g}-{b:g} m" for a, b in RANGES)
     columns = (
