@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812 - the field's name for it
 
-from cvcdepth_core.rig.poses import Pose, inverse
+from cvcdepth_core.refinement.moments import View
+from cvcdepth_core.rig.poses import inverse
 
 PATCH = 5
 _MARGIN = PATCH // 2
@@ -29,16 +30,6 @@ _PARALLAX_WIDTH = 320  # parallax is counted in pixels of a picture this wide
 _LEAST_PARALLAX, _LARGEST_PARALLAX = 1.0, 12.0
 _COARSE = 4  # pixels between those that are looked at to find what a source sees
 _TINY = 1e-12
-
-
-class View(NamedTuple):
-    """One camera's picture and where it was taken."""
-
-    grey: Tensor
-    """[h + 2, w + 2] grey levels, NaN where there is no picture and all around the border."""
-    intrinsics: NDArray[np.float64]
-    """[3, 3] pixels, without the border."""
-    world_T_camera: Pose
 
 
 class SweepCost(NamedTuple):
