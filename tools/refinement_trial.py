@@ -26,14 +26,19 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-import cvcdepth_core.refinement.refiner as refiner_module
 from cvcdepth_core.images.decoding import Picture
 from cvcdepth_core.images.rectifier import SurroundPreprocessor, to_tensor
 from cvcdepth_core.model_choices import checkpoint_path
 from cvcdepth_core.networks import PoseNet
 from cvcdepth_core.networks.checkpoint import load_checkpoint
 from cvcdepth_core.refinement.alignment import Twist, exponential, logarithm
-from cvcdepth_core.refinement.confidence import RIGHT_WITHIN, ConfidenceMap, fit_confidence_map
+from cvcdepth_core.refinement.confidence import (
+    RIGHT_WITHIN,
+    SHIPPED_MAPS,
+    ConfidenceMap,
+    ConfidenceMaps,
+    fit_confidence_map,
+)
 from cvcdepth_core.refinement.moments import SurroundMoment
 from cvcdepth_core.refinement.mounts import MountSearch, RefinedMounts
 from cvcdepth_core.refinement.refiner import RefinedDepth, SurroundRefiner
@@ -56,6 +61,7 @@ TRUSTED = 0.65  # confidence of depth that mounts are looked for with
 WARM_UP = 12  # sets before the held-out ones that fill the history
 AROUND = (-10, -5, 5, 10)  # sets in which the LiDAR has to see a point again that stands still
 SPOILT_SEED = 5
+IDENTITY = ConfidenceMap((0.0, 1.0), (0.0, 1.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,7 +252,8 @@ def refine_all(
     numbers = range(max(0, first - WARM_UP), len(recorded.sets) if prior is None else recorded.held_out[0])
     settings = RefinementSettings(max_grid_width=grid)
     settings = replace(settings, distances=()) if motion == "neighbours" else settings
-    refiner = SurroundRefiner(recorded.rig.neighbour_indices, settings)
+    maps = SHIPPED_MAPS if prior is None else ConfidenceMaps(IDENTITY, IDENTITY)
+    refiner = SurroundRefiner(recorded.rig.neighbour_indices, settings, confidence_maps=maps)
     aligning = RefinerWithoutOdometry(refiner, VisualOdometry()) if motion == "alignment" else None
     poses = network_poses(recorded.sets) if motion == "network" else None
     found = []
@@ -468,8 +475,6 @@ def coloured(values: NDArray[np.floating], least: float, most: float) -> NDArray
 
 def print_confidence_maps(recorded: Recorded, mounts: RefinedMounts) -> None:
     """Fit the maps to spoilt depth of the part before the held-out one, on two grids together; print their knots."""
-    identity = ConfidenceMap((0.0, 1.0), (0.0, 1.0))
-    refiner_module.REFINED_CONFIDENCE = refiner_module.PRIOR_CONFIDENCE = identity
     prior = [spoilt(one.moment.depth, SPOILT_SEED + number) for number, one in enumerate(recorded.sets)]
     found: dict[str, list[ConfidenceSamples]] = {"REFINED_CONFIDENCE": [], "PRIOR_CONFIDENCE": []}
     for grid in (160, 320):

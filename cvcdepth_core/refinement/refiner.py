@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cvcdepth_core.refinement.confidence import (
-    PRIOR_CONFIDENCE,
-    REFINED_CONFIDENCE,
+    SHIPPED_MAPS,
     ConfidenceMap,
+    ConfidenceMaps,
     checked_share,
     raw_confidence,
+    trusted_share,
 )
 from cvcdepth_core.refinement.fusion import averaged, posterior
 from cvcdepth_core.refinement.history import History
@@ -53,11 +54,13 @@ class SurroundRefiner:
         neighbours: Sequence[tuple[int, int]],
         settings: RefinementSettings | None = None,
         device: torch.device | str = "cpu",
+        confidence_maps: ConfidenceMaps = SHIPPED_MAPS,
     ) -> None:
         """`neighbours` are the rig's (camera, neighbour) indices, as `Rig.neighbour_indices` has them."""
         self.settings = settings or RefinementSettings()
         self._neighbours = tuple(neighbours)
         self._device = device
+        self._maps = confidence_maps
         self._history = History()
 
     def reset(self) -> None:
@@ -89,9 +92,9 @@ class SurroundRefiner:
             return _to_numpy(on_picture(mapped(raw) * share) * ~torch.isnan(depth))
 
         return RefinedDepth(
-            depth=_to_numpy(depth * on_picture(found.log_ratio).exp()),
-            confidence=confidence(raw, REFINED_CONFIDENCE),
-            prior_confidence=confidence(found.prior_right, PRIOR_CONFIDENCE),
+            depth=_to_numpy(depth * on_picture(found.log_ratio * trusted_share(raw)).exp()),
+            confidence=confidence(raw, self._maps.refined),
+            prior_confidence=confidence(found.prior_right, self._maps.prior),
             checked=_to_numpy(checked.float().mean((1, 2))),
         )
 
