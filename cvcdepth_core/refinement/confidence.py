@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -22,6 +23,7 @@ RIGHT_WITHIN = math.log(1.25)
 
 _BY_FINENESS, _BY_LOG_RATIO = 0.05, 0.06
 _LEAST_CONTRAST = 0.05
+_DOUBTED, _TRUSTED = 0.3, 0.5  # probability below which no correction is made, and from which on all of it
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,16 @@ PRIOR_CONFIDENCE = ConfidenceMap(
 """Of depth before refinement; raw: probability of the hypotheses within a factor of 1.25 of it."""
 
 
+class ConfidenceMaps(NamedTuple):
+    """What a checkpoint's raw confidence means."""
+
+    refined: ConfidenceMap = REFINED_CONFIDENCE
+    prior: ConfidenceMap = PRIOR_CONFIDENCE
+
+
+SHIPPED_MAPS = ConfidenceMaps()
+
+
 def raw_confidence(peak: Tensor, log_ratio: Tensor, fineness: Tensor) -> Tensor:
     """Return what ranks refined depth best, in [0, 1]; all arguments have the same shape.
 
@@ -65,6 +77,11 @@ def raw_confidence(peak: Tensor, log_ratio: Tensor, fineness: Tensor) -> Tensor:
     coarse. The two small exponents were chosen by AUSE on sets 14 to 29 of the sample recording.
     """
     return peak * fineness.clamp(min=1e-3).pow(_BY_FINENESS) * (-_BY_LOG_RATIO * log_ratio.abs()).exp()
+
+
+def trusted_share(raw: Tensor) -> Tensor:
+    """Return how much of a correction is made, in [0, 1]: less the likelier it is wrong; `raw` is raw confidence."""
+    return ((REFINED_CONFIDENCE(raw) - _DOUBTED) / (_TRUSTED - _DOUBTED)).clamp(0.0, 1.0)
 
 
 def checked_share(contrast: Tensor) -> Tensor:

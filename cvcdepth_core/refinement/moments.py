@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ from torch.nn import functional as F  # noqa: N812 - the field's name for it
 
 from cvcdepth_core.errors import ImageError
 from cvcdepth_core.rig.pinhole import scale_intrinsics
+from cvcdepth_core.rig.poses import Pose
 
 MIDDLE_GREY = 128.0
 
@@ -40,12 +42,23 @@ class SurroundMoment:
     """[N, 4, 4] the vehicle's pose at each exposure; None where its motion is not known."""
 
     def __post_init__(self) -> None:
-        shape = self.depth.shape
-        if self.pictures.shape != (*shape, 3) or self.valid.shape != shape:
-            raise ImageError(
-                f"surround set: depth is {list(shape)}, but pictures are {list(self.pictures.shape)} and valid is "
-                f"{list(self.valid.shape)}"
-            )
+        cameras, height, width = self.depth.shape
+        expected = {
+            "pictures": (cameras, height, width, 3),
+            "present": (cameras,),
+            "intrinsics": (cameras, 3, 3),
+            "valid": (cameras, height, width),
+            "base_T_camera": (cameras, 4, 4),
+            "times_ns": (cameras,),
+            "world_T_base": (cameras, 4, 4),
+        }
+        for name, shape in expected.items():
+            value = getattr(self, name)
+            if value is not None and value.shape != shape:
+                raise ImageError(
+                    f"surround set: {name} is {list(value.shape)}, but depth is {list(self.depth.shape)}: "
+                    f"{list(shape)} is expected"
+                )
 
     @property
     def camera_poses(self) -> NDArray[np.float64]:
@@ -62,6 +75,16 @@ class SurroundMoment:
         return int(self.times_ns[self.present].max(initial=0))
 
 
+class View(NamedTuple):
+    """One camera's picture and where it was taken."""
+
+    grey: Tensor
+    """[h + 2, w + 2] grey levels, NaN where there is no picture and all around the border."""
+    intrinsics: NDArray[np.float64]
+    """[3, 3] pixels, without the border."""
+    world_T_camera: Pose
+
+
 @dataclass(frozen=True, eq=False)
 class GridSet:
     """A surround set reduced to the grid that is matched on."""
@@ -72,8 +95,12 @@ class GridSet:
     """[N, h, w] metres, NaN where unknown."""
     intrinsics: NDArray[np.float64]
     """[N, 3, 3] pixels of the grid, without the border."""
-    world_T_camera: NDArray[np.float64]
+    base_T_camera: NDArray[np.float64]
     """[N, 4, 4]."""
+    world_T_camera: NDArray[np.float64]
+    """[N, 4, 4]; the same as `base_T_camera` where the vehicle's motion is not known."""
+    placed: bool
+    """Whether the vehicle's motion is known."""
     reduction: int
     """Picture pixels per pixel of the grid, along each axis."""
 
@@ -81,6 +108,10 @@ class GridSet:
     def inner(self) -> Tensor:
         """The grey levels [N, h, w] without the border."""
         return self.grey[:, 1:-1, 1:-1]
+
+    def view(self, camera: int) -> View:
+        """Return one camera's picture."""
+        return View(self.grey[camera], self.intrinsics[camera], self.world_T_camera[camera])
 
 
 def reduction_for(width: int, height: int, max_width: int) -> int:
@@ -103,14 +134,23 @@ def to_grid(moment: SurroundMoment, max_width: int, device: torch.device | str =
         grey=F.pad(reduced(levels, reduction), (1, 1, 1, 1), value=torch.nan),
         depth=reduced_depth(torch.from_numpy(moment.depth).to(device), reduction),
         intrinsics=np.stack([scale_intrinsics(K, scale) for K in moment.intrinsics]),
+        base_T_camera=moment.base_T_camera,
         world_T_camera=moment.camera_poses,
+        placed=moment.world_T_base is not None,
         reduction=reduction,
     )
 
 
 def reduced(images: Tensor, reduction: int) -> Tensor:
-    """Average `images` [N, H, W] over squares of `reduction` pixels; NaN where any of them is."""
-    return images if reduction == 1 else F.avg_pool2d(images.unsqueeze(1), reduction).squeeze(1)
+    """Average `images` [N, H, W] over squares of `reduction` pixels, a power of two; NaN where any of them is.
+
+    What does not fill a square at the right or lower border is left out.
+    """
+    while reduction > 1:
+        rows = images[:, :-1:2] + images[:, 1::2]
+        images = (rows[:, :, :-1:2] + rows[:, :, 1::2]) / 4
+        reduction //= 2
+    return images
 
 
 def reduced_depth(depth: Tensor, reduction: int) -> Tensor:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812 - the field's name for it
 
+from cvcdepth_core.errors import RigError
 from cvcdepth_core.refinement.moments import SurroundMoment, to_grid
 from cvcdepth_core.rendering.projection import axis_angle_to_rotation
 from cvcdepth_core.rig.poses import inverse
@@ -102,9 +103,9 @@ class MountSearch:
                 )
 
     def result(self) -> RefinedMounts:
-        """Search every pair and make the turns consistent around the rig; ValueError before the first set."""
+        """Search every pair and make the turns consistent around the rig; RigError before the first set."""
         if self._base_T_camera is None:
-            raise ValueError("no set was added")
+            raise RigError("mounts: no set was added to look for turned cameras in")
         pairs = [_pair_turn(*pair, patches) for pair, patches in self._patches.items()]
         return consistent_mounts(self._base_T_camera, self._anchor, pairs)
 

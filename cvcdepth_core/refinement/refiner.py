@@ -12,17 +12,18 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cvcdepth_core.refinement.confidence import (
-    PRIOR_CONFIDENCE,
-    REFINED_CONFIDENCE,
+    SHIPPED_MAPS,
     ConfidenceMap,
+    ConfidenceMaps,
     checked_share,
     raw_confidence,
+    trusted_share,
 )
 from cvcdepth_core.refinement.fusion import averaged, posterior
 from cvcdepth_core.refinement.history import History
-from cvcdepth_core.refinement.moments import GridSet, SurroundMoment, enlarged, to_grid
+from cvcdepth_core.refinement.moments import GridSet, SurroundMoment, View, enlarged, to_grid
 from cvcdepth_core.refinement.movers import guard_cost
-from cvcdepth_core.refinement.plane_sweep import SweepCost, View, sweep
+from cvcdepth_core.refinement.plane_sweep import SweepCost, sweep
 from cvcdepth_core.refinement.settings import RefinementSettings
 
 _CONTRAST_SHARE = 0.055
@@ -53,11 +54,13 @@ class SurroundRefiner:
         neighbours: Sequence[tuple[int, int]],
         settings: RefinementSettings | None = None,
         device: torch.device | str = "cpu",
+        confidence_maps: ConfidenceMaps = SHIPPED_MAPS,
     ) -> None:
         """`neighbours` are the rig's (camera, neighbour) indices, as `Rig.neighbour_indices` has them."""
         self.settings = settings or RefinementSettings()
         self._neighbours = tuple(neighbours)
         self._device = device
+        self._maps = confidence_maps
         self._history = History()
 
     def reset(self) -> None:
@@ -68,10 +71,9 @@ class SurroundRefiner:
     def refine(self, moment: SurroundMoment) -> RefinedDepth:
         """Refine the depth of the next set; a set that cannot follow the last one begins a new history."""
         grid = to_grid(moment, self.settings.max_grid_width, self._device)
-        if not self._history.fits(grid, moment.time_ns):
-            self.reset()
+        self._history.advance(grid, moment.present, moment.time_ns)
         refined = self._refined(moment, grid)
-        if moment.world_T_base is not None:
+        if grid.placed:
             self._history.add(grid, moment.present, moment.time_ns)
         return refined
 
@@ -90,9 +92,9 @@ class SurroundRefiner:
             return _to_numpy(on_picture(mapped(raw) * share) * ~torch.isnan(depth))
 
         return RefinedDepth(
-            depth=_to_numpy(depth * on_picture(found.log_ratio).exp()),
-            confidence=confidence(raw, REFINED_CONFIDENCE),
-            prior_confidence=confidence(found.prior_right, PRIOR_CONFIDENCE),
+            depth=_to_numpy(depth * on_picture(found.log_ratio * trusted_share(raw)).exp()),
+            confidence=confidence(raw, self._maps.refined),
+            prior_confidence=confidence(found.prior_right, self._maps.prior),
             checked=_to_numpy(checked.float().mean((1, 2))),
         )
 
@@ -106,28 +108,18 @@ class SurroundRefiner:
 
     def _swept(self, moment: SurroundMoment, grid: GridSet, camera: int) -> SweepCost:
         log_ratios = self.settings.log_ratios(self._device)
-        view, depth = _view(grid, camera), grid.depth[camera]
-        earlier = self._earlier(moment, grid, camera)
-        found = sweep(view, depth, [*earlier, *self._beside(moment, grid, camera)], log_ratios)
+        view, depth = grid.view(camera), grid.depth[camera]
+        earlier = self._history.sources(camera, view.world_T_camera, self.settings.distances) if grid.placed else []
+        beside = self._beside(moment, grid, camera) if self.settings.use_neighbours else []
+        found = sweep(view, depth, [*earlier, *beside], log_ratios)
         if earlier:
             way = _way(view, earlier[-1])
             found.cost.add_(guard_cost(way, view.intrinsics, (depth.shape[0], depth.shape[1]), log_ratios))
         return found
 
-    def _earlier(self, moment: SurroundMoment, grid: GridSet, camera: int) -> list[View]:
-        if moment.world_T_base is None or not moment.present[camera]:
-            return []
-        return self._history.sources(camera, grid.world_T_camera, self.settings.distances)
-
     def _beside(self, moment: SurroundMoment, grid: GridSet, camera: int) -> list[View]:
-        if not (self.settings.use_neighbours and moment.present[camera]):
-            return []
-        others = [other for one, other in self._neighbours if one == camera and moment.present[other]]
-        return [_view(grid, other) for other in others]
-
-
-def _view(grid: GridSet, camera: int) -> View:
-    return View(grid.grey[camera], grid.intrinsics[camera], grid.world_T_camera[camera])
+        others = [other for one, other in self._neighbours if one == camera]
+        return [grid.view(other) for other in others if moment.present[other]]
 
 
 def _way(view: View, earlier: View) -> NDArray[np.float64]:

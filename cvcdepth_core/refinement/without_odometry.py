@@ -38,5 +38,5 @@ class RefinerWithoutOdometry:
         self.motion = self._odometry.track(moment, guess)
         refined = self._refiner.refine(replace(moment, world_T_base=self._odometry.base_poses()))
         sure = refined.confidence > _TRUSTED
-        self._odometry.keep(np.where(sure, refined.depth, np.nan) if sure.any() else moment.depth)
+        self._odometry.keep(np.where(sure, refined.depth, np.float32(np.nan)) if sure.any() else moment.depth)
         return refined

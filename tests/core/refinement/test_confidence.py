@@ -13,6 +13,7 @@ from cvcdepth_core.refinement.confidence import (
     checked_share,
     fit_confidence_map,
     raw_confidence,
+    trusted_share,
 )
 
 
@@ -68,6 +69,12 @@ def test_what_is_coarse_or_far_from_the_prior_is_less_sure():
     assert raw_confidence(peak, zero, one) == pytest.approx(0.9)
     assert raw_confidence(peak, torch.tensor(-0.5), one) < 0.9
     assert 0 < raw_confidence(peak, zero, zero) < 0.9
+
+
+def test_a_correction_that_is_likely_wrong_is_made_in_part_only():
+    share = trusted_share(torch.tensor([0.5, 0.8, 0.9, 1.0]))
+    assert 0 <= share[0] < share[1] < 1
+    torch.testing.assert_close(share[2:], torch.ones(2))
 
 
 def test_without_contrast_nothing_is_checked():

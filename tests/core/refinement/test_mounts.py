@@ -9,6 +9,7 @@ import torch
 from solid_world import street
 from surround_drive import Drive, looking, ring, straight
 
+from cvcdepth_core.errors import RigError
 from cvcdepth_core.refinement.mounts import MountSearch, PairTurn, RefinedMounts, consistent_mounts
 from cvcdepth_core.rendering.projection import axis_angle_to_rotation
 
@@ -81,7 +82,7 @@ def test_without_overlap_a_camera_keeps_its_mount():
 
 
 def test_no_set_at_all_is_an_error():
-    with pytest.raises(ValueError, match="no set was added"):
+    with pytest.raises(RigError, match="no set was added"):
         MountSearch(PAIRS, anchor=0).result()
 
 

@@ -9,7 +9,8 @@ import torch
 from solid_world import Rectangle, camera_matrix, pose, render
 from surround_drive import FOCAL, SIZE, looking
 
-from cvcdepth_core.refinement.plane_sweep import View, sweep
+from cvcdepth_core.refinement.moments import View
+from cvcdepth_core.refinement.plane_sweep import sweep
 
 LOG_RATIOS = torch.arange(-8, 9) * 0.1
 K = camera_matrix(*SIZE, FOCAL)

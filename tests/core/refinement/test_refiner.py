@@ -225,7 +225,7 @@ def test_a_reset_forgets_all_that_was_before():
     assert bits(refiner.refine(moments[-1])) == bits(SurroundRefiner([]).refine(moments[-1]))
 
 
-@pytest.mark.parametrize("change", ["time goes back", "position jumps", "other lens"])
+@pytest.mark.parametrize("change", ["time goes back", "position jumps", "other lens", "other mount"])
 def test_a_set_that_cannot_follow_the_last_begins_anew(change: str):
     drive = Drive(WALL, ONE, straight((0.0, 4.0, 0.0)))
     refiner = SurroundRefiner([])
@@ -236,8 +236,10 @@ def test_a_set_that_cannot_follow_the_last_begins_anew(change: str):
         moment = replace(moment, times_ns=moment.times_ns - 2 * SECOND)
     elif change == "position jumps":
         moment = replace(moment, world_T_base=pose(y=40.0) @ moment.world_T_base)
-    else:
+    elif change == "other lens":
         moment = replace(moment, intrinsics=moment.intrinsics * 1.01)
+    else:
+        moment = replace(moment, base_T_camera=moment.base_T_camera @ pose(x=0.01))
     assert not refiner.refine(moment).confidence.any()
 
 
@@ -248,6 +250,15 @@ def test_while_the_motion_is_unknown_neighbours_alone_count_and_nothing_is_kept(
     found = [refiner.refine(moment) for moment in moments]
     assert bits(found[-1]) == bits(SurroundRefiner(PAIR).refine(moments[-1]))
     assert 0 < found[-1].checked.max() < 1
+
+
+def test_a_set_without_motion_in_between_forgets_nothing():
+    drive = Drive(WALL, ONE, straight((0.0, 4.0, 0.0)))
+    refiner = SurroundRefiner([])
+    for time in (0.0, 0.1, 0.2):
+        moment = drive.moment(time, 1.3)
+        refined = refiner.refine(replace(moment, world_T_base=None) if time == 0.1 else moment)
+    assert refined.checked[0] > 0.8
 
 
 def test_a_finer_grid_tells_more_exactly():
@@ -269,10 +280,17 @@ def test_confidence_is_larger_where_depth_is_right():
     assert refined.confidence[right].mean() > refined.confidence[~right].mean() + 0.1
 
 
-def test_sizes_that_do_not_fit_are_refused_with_all_of_them():
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("pictures", r"pictures is \[1, 48, 160, 3\], but depth is \[1, 96, 160\]: \[1, 96, 160, 3\] is expected"),
+        ("world_T_base", r"world_T_base is \[1, 2, 4\], .* \[1, 4, 4\] is expected"),
+    ],
+)
+def test_arrays_that_do_not_fit_are_refused_by_name_and_size(name: str, message: str):
     moment = Drive(WALL, ONE, straight()).moment(0.0)
-    with pytest.raises(ImageError, match=r"depth is \[1, 96, 160\], but pictures are \[1, 48, 160, 3\]"):
-        replace(moment, pictures=moment.pictures[:, ::2])
+    with pytest.raises(ImageError, match=message):
+        replace(moment, **{name: getattr(moment, name)[:, ::2]})
 
 
 @pytest.mark.parametrize(
