@@ -14,10 +14,10 @@ from cvcdepth_core.worlds.generation.street import furniture, wires
 from cvcdepth_core.worlds.generation.traffic import parked_vehicles, people, traffic
 
 
-def furnish(world: WorldSpec, kind: Kind, layout: Layout, dice: Dice, seconds: float) -> WorldSpec:
+def furnish(world: WorldSpec, kind: Kind, layout: Layout, dice: Dice) -> WorldSpec:
     """Return the world with all that such a place has; large things take their places first."""
     special = special_places(world, layout, dice)
-    moving = traffic(world, kind, layout, dice, seconds)
+    moving = traffic(world, kind, layout, dice)
     buildings = houses(kind, layout, dice)
     far = skyline(kind, layout, dice)
     lines, poles = wires(kind, layout, dice)

@@ -32,11 +32,11 @@ def special_places(world: WorldSpec, layout: Layout, dice: Dice) -> Special:
     """Return what belongs to the kind of place, and what any road may have."""
     special = Special()
     if world.kind == "tunnel":
-        special.structures += (_tunnel(world, layout, dice),)
+        special.structures += (_tunnel(layout, dice),)
     elif world.kind == "parking_deck":
         _parking_deck(world, layout, dice, special)
     elif world.kind in ("city", "suburb", "industrial", "yard", "highway"):
-        _lots(world, layout, dice, special)
+        _lots(layout, dice, special)
     if world.kind in ("highway", "city", "rural", "industrial") and dice.chance(0.16):
         special.structures += _bridges(layout, dice)
     if world.kind == "highway" and dice.chance(0.5):
@@ -51,7 +51,7 @@ def special_places(world: WorldSpec, layout: Layout, dice: Dice) -> Special:
     return special
 
 
-def _tunnel(world: WorldSpec, layout: Layout, dice: Dice) -> Structure:
+def _tunnel(layout: Layout, dice: Dice) -> Structure:
     width = layout.edge(1.0) + layout.edge(-1.0) + 0.1
     middle = (layout.edge(1.0) - layout.edge(-1.0)) / 2
     length = dice.between(80, 200, 0)
@@ -88,7 +88,7 @@ def _parking_deck(world: WorldSpec, layout: Layout, dice: Dice, special: Special
             s += 2.5
 
 
-def _lots(world: WorldSpec, layout: Layout, dice: Dice, special: Special) -> None:
+def _lots(layout: Layout, dice: Dice, special: Special) -> None:
     """Car parks, lawns and gravel beside the road."""
     surfaces: tuple[SurfaceKind, ...] = ("asphalt", "gravel", "grass", "concrete", "dirt")
     for _ in range(dice.whole(0, 4)):

@@ -27,6 +27,8 @@ from cvcdepth_core.worlds.generation.layout import Layout
 from cvcdepth_core.worlds.generation.parts import furnish
 
 _BEHIND, _AHEAD = 90.0, 110.0  # metres of world behind the start and beyond the end of the drive
+_CROSS_HALF = 130.0  # metres of the crossing road on either side
+_CROSS_LANE = 1.7  # metres from its middle to that of its lanes
 _WEIGHTS: dict[WorldKind, float] = {name: kind.weight for name, kind in KINDS.items()}
 
 
@@ -70,7 +72,7 @@ class _Author:
             roads=roads,
             drive=drive,
         )
-        return furnish(base, self.kind, layout, Dice(self.seed, 107), self.seconds)
+        return furnish(base, self.kind, layout, Dice(self.seed, 107))
 
     # The drive.
 
@@ -111,23 +113,17 @@ class _Author:
         lateral = round(lateral + dice.normal(0.2), 2)
         if not self.kind.lanes[0] and road.lanes == 0:
             lateral = dice.between(-3, 3)
-        bends = self._turn(road, lateral) if len(roads) > 1 and road.bends[0][1] == 0 and dice.chance(0.35) else None
+        bends = self._turn() if len(roads) > 1 and dice.chance(0.35) else None
         return Drive(at=(_BEHIND, lateral), speeds=speeds, bends=bends)
 
-    def _turn(self, road: Road, lateral: float) -> tuple[tuple[float, float], ...]:
+    def _turn(self) -> tuple[tuple[float, float], ...]:
         """Turn into the crossing road, to the right or left, at the crossing's lane."""
         to_left = self.dice.chance(0.5)
-        crossing = _BEHIND + self.kind.crossing_at
-        cross = self._cross_lane
         radius = 11.0 if to_left else 7.0
-        lane_s = crossing + cross if to_left else crossing - cross
-        straight = max(0.5, lane_s - radius - _BEHIND)
+        lane = self.kind.crossing_at + (_CROSS_LANE if to_left else -_CROSS_LANE)
+        straight = max(0.5, lane - radius)
         side = 1.0 if to_left else -1.0
         return (round(straight, 2), 0.0), (round(math.pi / 2 * radius, 2), round(side / radius, 4)), (200.0, 0.0)
-
-    @property
-    def _cross_lane(self) -> float:
-        return 1.7
 
     # The roads.
 
@@ -136,13 +132,11 @@ class _Author:
         main = self._main_road(length)
         if not dice.chance(kind.crossing):
             return (main,)
-        at = _BEHIND + kind.crossing_at
-        x, y = at, 0.0
-        if main.bends[0][1] != 0.0:
+        if len(main.bends) > 1 or main.bends[0][1] != 0.0:  # its place is that of a straight road
             return (main,)
-        half = 130.0
+        at, half = _BEHIND + kind.crossing_at, _CROSS_HALF
         cross = Road(
-            start=(x, y - half, 90.0),
+            start=(at, -half, 90.0),
             bends=((2 * half, 0.0),),
             lanes=2,
             lane_width=3.4,

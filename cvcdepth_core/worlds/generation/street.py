@@ -26,7 +26,7 @@ _ROOM: dict[FurnitureKind, tuple[float, float]] = {
 
 def furniture(world: WorldSpec, kind: Kind, layout: Layout, dice: Dice) -> tuple[Furniture, ...]:
     """Everything but what carries wires."""
-    parts = [*_lamps(kind, layout, dice), *_signs(kind, layout, dice), *_lights(world, kind, layout, dice)]
+    parts = [*_lamps(kind, layout, dice), *_signs(kind, layout, dice), *_lights(kind, layout, dice)]
     return (*parts, *_clutter(world, kind, layout, dice), *_road_works(world, layout, dice))
 
 
@@ -103,7 +103,7 @@ def _signs(kind: Kind, layout: Layout, dice: Dice) -> Iterator[Furniture]:
             )
 
 
-def _lights(world: WorldSpec, kind: Kind, layout: Layout, dice: Dice) -> Iterator[Furniture]:
+def _lights(kind: Kind, layout: Layout, dice: Dice) -> Iterator[Furniture]:
     """Traffic lights at a crossing."""
     if len(layout.corridors) < 2 or not dice.chance(0.6):
         return

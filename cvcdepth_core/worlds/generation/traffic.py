@@ -39,7 +39,7 @@ class Moving(NamedTuple):
     people: tuple[Person, ...]
 
 
-def traffic(world: WorldSpec, kind: Kind, layout: Layout, dice: Dice, seconds: float) -> Moving:
+def traffic(world: WorldSpec, kind: Kind, layout: Layout, dice: Dice) -> Moving:
     """Vehicles in all lanes, as fast as the others of their lane, and cyclists at the edges."""
     vehicles: list[Vehicle] = []
     share = dice.between(*kind.traffic)
@@ -49,7 +49,7 @@ def traffic(world: WorldSpec, kind: Kind, layout: Layout, dice: Dice, seconds: f
         if not (turns and road):
             for lane in range(world.roads[road].lanes):
                 vehicles += _lane(world, layout, dice, road, lane, share)
-    cyclists = [] if turns else [*_cyclists(world, kind, layout, dice)]
+    cyclists = [] if turns else [*_cyclists(kind, layout, dice)]
     return Moving(tuple(vehicles), tuple(cyclists))
 
 
@@ -70,9 +70,7 @@ def _lane(world: WorldSpec, layout: Layout, dice: Dice, road: int, lane: int, sh
         gap = dice.scale(2.5, 25.0) if speeds == ((0.0, 0.0),) else dice.scale(6.0, 40.0)
         middle = s + length / 2
         ahead = abs(middle - drive.at[0])
-        room = (not own or ahead > length / 2 + _OWN_ROOM) and not (
-            crossing and _near_crossing(world, layout, middle, road)
-        )
+        room = (not own or ahead > length / 2 + _OWN_ROOM) and not (crossing and _near_crossing(world, middle, road))
         if room and dice.chance(share):
             at = (round(middle, 2), round(lateral + dice.normal(0.15), 2))
             motion = Motion(speeds=speeds)
@@ -88,9 +86,9 @@ def _lane(world: WorldSpec, layout: Layout, dice: Dice, road: int, lane: int, sh
         s += length + gap
 
 
-def _near_crossing(world: WorldSpec, layout: Layout, s: float, road: int) -> bool:
+def _near_crossing(world: WorldSpec, s: float, road: int) -> bool:
     """Nobody is on the crossing at the beginning; lanes that cross are never busy at once."""
-    middle = 130.0 if road else world.roads[1].start[0]
+    middle = -world.roads[1].start[1] if road else world.roads[1].start[0]
     return abs(s - middle) < 14.0
 
 
@@ -105,7 +103,7 @@ def _speeds(world: WorldSpec, dice: Dice, own: bool, waits: bool) -> tuple[tuple
     )
 
 
-def _cyclists(world: WorldSpec, kind: Kind, layout: Layout, dice: Dice) -> Iterator[Person]:
+def _cyclists(kind: Kind, layout: Layout, dice: Dice) -> Iterator[Person]:
     first, last = layout.span()
     for _ in range(dice.whole(*(int(n) for n in kind.cyclists))):
         side = dice.pick(-1.0, 1.0)
@@ -127,7 +125,7 @@ def parked_vehicles(world: WorldSpec, kind: Kind, layout: Layout, dice: Dice) ->
     for road, spec in enumerate(world.roads):
         for side, edge in zip((1.0, -1.0), spec.edge, strict=True):
             if spec.lanes and edge > 1.9:
-                found += _at_kerb(world, layout, dice, road, side, share, edge)
+                found += _at_kerb(layout, dice, road, side, share, edge)
         if not spec.lanes:
             found += _on_place(world, layout, dice, share)
     if kind.setback[1] > 5:
@@ -135,9 +133,7 @@ def parked_vehicles(world: WorldSpec, kind: Kind, layout: Layout, dice: Dice) ->
     return tuple(found)
 
 
-def _at_kerb(
-    world: WorldSpec, layout: Layout, dice: Dice, road: int, side: float, share: float, edge: float
-) -> Iterator[Vehicle]:
+def _at_kerb(layout: Layout, dice: Dice, road: int, side: float, share: float, edge: float) -> Iterator[Vehicle]:
     s, last = layout.span(road)
     while s < last:
         name: VehicleKind = dice.weighted(_PARKED)

@@ -12,8 +12,7 @@ from cvcdepth_core.errors import RigError
 from cvcdepth_core.rig.calibration import Calibration
 from cvcdepth_core.worlds.shapes.meshes import Floats
 
-_ITERATIONS = 300
-_ACCURACY = 1e-13
+_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 300, 1e-13)
 _MAX_ERROR = 1e-3  # pixels by which a ray may miss its pixel when it is projected again
 
 
@@ -82,12 +81,13 @@ class Lens:
         if self._rectified:
             K = c.rectified_intrinsics
             return (pixels - K[:2, 2] - np.outer(pixels[:, 1] - K[1, 2], [K[0, 1] / K[1, 1], 0.0])) / K[[0, 1], [0, 1]]
-        fisheye = c.distortion_model == "equidistant"
-        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, _ITERATIONS, _ACCURACY)
-        undistort = cv2.fisheye.undistortPoints if fisheye else cv2.undistortPoints
-        found = undistort(
-            np.ascontiguousarray(pixels[:, None], np.float64), c.raw_intrinsics, c.distortion, criteria=criteria
-        )
+        source = np.ascontiguousarray(pixels[:, None], np.float64)
+        if c.distortion_model == "equidistant":
+            found = cv2.fisheye.undistortPoints(source, c.raw_intrinsics, c.distortion, criteria=_CRITERIA)
+        elif hasattr(cv2, "undistortPointsIter"):  # OpenCV 4, whose undistortPoints stops after five iterations
+            found = cv2.undistortPointsIter(source, c.raw_intrinsics, c.distortion, np.eye(3), np.eye(3), _CRITERIA)
+        else:
+            found = cv2.undistortPoints(source, c.raw_intrinsics, c.distortion, criteria=_CRITERIA)
         normalised: Floats = np.asarray(found, np.float64).reshape(-1, 2)
         self._check(pixels, normalised)
         return normalised

@@ -112,7 +112,7 @@ def test_noise_has_mean_0_and_deviation_1_and_fades_where_it_cannot_be_seen():
         assert 0.6 < near.std() < 1.15  # what lies between two texels is a mean of them
         assert far.std() < near.std()
     repeated = noise(Noise.ROUGH, u + 256, v - 512, np.ones(len(u), np.float32))
-    assert repeated == pytest.approx(noise(Noise.ROUGH, u, v, np.ones(len(u), np.float32)), abs=0.05)
+    assert repeated == pytest.approx(noise(Noise.ROUGH, u, v, np.ones(len(u), np.float32)), abs=0.15)
 
 
 def test_fixed_exposure_keeps_brightness_and_automatic_exposure_evens_it_out():
