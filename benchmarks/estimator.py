@@ -140,7 +140,7 @@ def work(connection: Connection, case: Case, device: str, threads: int) -> None:
     """Answer what `Worker.ask` asks."""
     import torch
 
-    from cvcdepth_ros.live.process_setup import prepare_process
+    from cvcdepth_ros.process_setup import prepare_process
 
     torch.set_num_threads(threads)
     if case[0] != BASELINE[0]:

@@ -11,6 +11,7 @@ from typing import Any, Protocol
 from cvcdepth_core.errors import CvcDepthError, NotPromotedError
 from cvcdepth_ros.commands import bench, check, evaluate, export, finetune, inspect, play, rig, run
 from cvcdepth_ros.installation import package_version
+from cvcdepth_ros.process_setup import openmp_environment
 
 PROGRAM = "cvcdepth"
 """The program's name in examples, messages and results. ROS users know it as `bag_replay` too."""
@@ -49,6 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Wrong use ends by SystemExit(2).
     """
+    os.environ.update(openmp_environment())  # before a command loads torch
     program = "bag_replay" if Path(sys.argv[0]).name == "bag_replay" else PROGRAM
     try:
         parsed = build_parser(program).parse_args(arguments)

@@ -1,8 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """`surround_depth_node`: a managed node that turns synchronised camera images into depth images and point clouds."""
 
-import argparse
 import os
+
+from cvcdepth_ros.process_setup import openmp_environment, prepare_process, return_memory
+
+os.environ.update(openmp_environment())  # before the imports below load torch
+
+import argparse
 import signal
 import sys
 from collections.abc import Sequence
@@ -20,7 +25,6 @@ from cvcdepth_core.errors import CvcDepthError
 from cvcdepth_core.estimator import DepthEstimator
 from cvcdepth_core.rig.rig_file import RigLayout, load_rig_layout
 from cvcdepth_ros.live.camera_states import CameraCondition, CameraState
-from cvcdepth_ros.live.process_setup import prepare_process, return_memory
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
 from cvcdepth_ros.node.diagnostics import ERROR, OK, WARN, status
 from cvcdepth_ros.node.live_rig import LiveRigDiscovery

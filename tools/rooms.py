@@ -51,6 +51,7 @@ CORE_ROOMS = {
 }
 ROS_ROOMS = {
     "installation": "",
+    "process_setup": "installation",
     "settings": "",
     "console": "",
     "recently_used": "",
@@ -59,20 +60,20 @@ ROS_ROOMS = {
     "messages": "bags",
     "surround_sets": "settings messages",
     "recordings": "settings bags kept messages surround_sets",
-    "live": "installation messages surround_sets",
+    "live": "messages surround_sets",
     "checks": "settings bags messages surround_sets recordings",
     "training_data": "settings recently_used bags kept messages surround_sets recordings",
-    "evaluation": "installation settings console bags kept surround_sets recordings",
+    "evaluation": "installation process_setup settings console bags kept surround_sets recordings",
     "node": "settings bags messages surround_sets live",
     "finetuning": "installation settings console bags kept surround_sets recordings checks training_data evaluation",
-    "end_to_end": "installation console bags messages surround_sets live node",
-    "bench": "messages surround_sets live node",
+    "end_to_end": "installation process_setup console bags messages surround_sets live node",
+    "bench": "process_setup messages surround_sets live node",
     "reports": "console messages evaluation finetuning",
-    "commands": "installation settings console bags kept messages surround_sets recordings live checks training_data "
-    "evaluation node finetuning end_to_end bench reports",
+    "commands": "installation process_setup settings console bags kept messages surround_sets recordings live checks "
+    "training_data evaluation node finetuning end_to_end bench reports",
     "demo": "installation settings console bags messages surround_sets recordings end_to_end reports",
-    "bag_replay": "installation commands",
-    "surround_depth_node": "messages live node",
+    "bag_replay": "installation process_setup commands",
+    "surround_depth_node": "process_setup messages live node",
 }
 
 

@@ -22,6 +22,7 @@ from cvcdepth_ros.commands.arguments import (
 )
 from cvcdepth_ros.console import print_result, progress_bar, table, warn
 from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings, unique_names
+from cvcdepth_ros.process_setup import prepare_long_work
 from cvcdepth_ros.reports import REPORT_FILE, can_draw_report
 
 if TYPE_CHECKING:
@@ -88,6 +89,7 @@ def execute(arguments: argparse.Namespace) -> None:
     if arguments.compare:
         content, text = _comparison(*arguments.compare)
     else:
+        prepare_long_work()
         content, text = _evaluation(arguments)
     print_result(content, text, arguments.json)
 
