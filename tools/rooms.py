@@ -29,12 +29,13 @@ FORMATS = re.compile(r"rosbags|mcap|mcap_\w+")
 """Packages that know how ROS stores messages: those, and no ROS, are for the package around core."""
 
 # From the ground floor up: the room, and the rooms that it may import.
-_GROUND = "errors stamps files model_choices surround_depth"
+_GROUND = "errors stamps files processor model_choices surround_depth"
 
 CORE_ROOMS = {
     "errors": "",
     "stamps": "errors",
     "files": "errors",
+    "processor": "",
     "model_choices": "errors",
     "surround_depth": "",
     "rig": _GROUND,
