@@ -406,8 +406,8 @@ def _autocast(config: TrainingConfig, device: torch.device) -> str:
 def _refuse_slow_bfloat16(autocast: str, device: torch.device) -> None:
     if autocast == "bfloat16" and device.type == "cpu" and not multiplies_bfloat16():
         raise ConfigError(
-            "optimizer.autocast is bfloat16, or auto and the run began with it, but this CPU does not "
-            f"multiply bfloat16 (no {' or '.join(BFLOAT16)}) and would be slow; go on where one does, or begin anew with none"
+            "optimizer.autocast is bfloat16, or auto and the run began with it, but this CPU does not multiply "
+            f"bfloat16 (no {' or '.join(BFLOAT16)}) and would be slow; go on where one does, or begin anew with none"
         )
 
 
