@@ -87,6 +87,13 @@ def non_negative(text: str) -> float:
     return number
 
 
+def count(text: str) -> int:
+    """Return the whole number of at least one that an option's text says; for argparse."""
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of at least 1")
+    return int(text)
+
+
 def _bar_format(total: float | None, unit: str, label: str, decimals: int) -> str:
     """Return the bar's form in tqdm's language."""
     prefix = "{desc}: " if label else ""
