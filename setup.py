@@ -44,7 +44,10 @@ setup(
     install_requires=["torch>=2.3", *requirements("core")],
     extras_require={
         "ros-jazzy": requirements("ros"),
-        **{name: requirements(name) for name in ("s3", "report", "fleet", "tensorboard", "onnx", "video", "worlds")},
+        **{
+            name: requirements(name)
+            for name in ("s3", "report", "fleet", "tensorboard", "onnx", "openvino", "video", "worlds")
+        },
     },
     zip_safe=False,
     entry_points={

@@ -24,7 +24,7 @@ from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.surround_depth import SurroundDepth
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.bench.baseline_cloud import baseline_cloud
-from cvcdepth_ros.live.process_setup import prepare_process
+from cvcdepth_ros.process_setup import prepare_process
 from cvcdepth_ros.recordings.rig import discover_rig
 
 SAMPLE = Path(__file__).parent.parent / "samples" / "pandaset_002_excerpt"

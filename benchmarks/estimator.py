@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 CAMERAS = 6
 BASELINE = ("torch eager batch", "resnet18", 384, 640)
 KEPT_BUFFERS = "torch eager batch, buffers kept"
-CPU_BACKENDS = ("torch_eager", "torch", "ncnn", "onnxruntime")
+CPU_BACKENDS = ("torch_eager", "torch", "ncnn", "openvino", "onnxruntime")
 CUDA_BACKENDS = ("torch_eager", "torch", "torch_compiled", "onnxruntime", "tensorrt")
 
 Case = tuple[str, str, int, int]
@@ -140,7 +140,7 @@ def work(connection: Connection, case: Case, device: str, threads: int) -> None:
     """Answer what `Worker.ask` asks."""
     import torch
 
-    from cvcdepth_ros.live.process_setup import prepare_process
+    from cvcdepth_ros.process_setup import prepare_process
 
     torch.set_num_threads(threads)
     if case[0] != BASELINE[0]:

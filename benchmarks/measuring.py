@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-_PACKAGES = ("torch", "numpy", "opencv-python-headless", "ncnn", "onnxruntime")
+_PACKAGES = ("torch", "numpy", "opencv-python-headless", "ncnn", "openvino", "onnxruntime")
 
 
 @dataclass

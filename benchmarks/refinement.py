@@ -27,7 +27,7 @@ from cvcdepth_core.refinement.settings import RefinementSettings
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings
 from cvcdepth_ros.evaluation.measuring import MeasuredSet, open_evaluation
-from cvcdepth_ros.live.process_setup import prepare_process
+from cvcdepth_ros.process_setup import prepare_process
 
 SAMPLE = Path(__file__).parent.parent / "samples" / "pandaset_002_excerpt"
 

@@ -11,7 +11,7 @@ EncoderName = Literal["resnet18", "resnet34", "efficientnet_lite0"]
 """Backbone of a depth or pose network."""
 ENCODERS: tuple[EncoderName, ...] = get_args(EncoderName)
 
-Backend = Literal["auto", "ncnn", "torch", "torch_eager", "torch_compiled", "onnxruntime", "tensorrt"]
+Backend = Literal["auto", "ncnn", "openvino", "torch", "torch_eager", "torch_compiled", "onnxruntime", "tensorrt"]
 """Engine that runs a depth network; `auto` takes the best that is there."""
 BACKENDS: tuple[Backend, ...] = get_args(Backend)
 

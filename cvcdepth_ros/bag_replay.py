@@ -24,6 +24,7 @@ from cvcdepth_ros.commands import (
 )
 from cvcdepth_ros.console import styled
 from cvcdepth_ros.installation import package_version
+from cvcdepth_ros.process_setup import openmp_environment
 
 PROGRAM = "cvcdepth"
 """The program's name in examples, messages and results. ROS users know it as `bag_replay` too."""
@@ -64,6 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Wrong use ends by SystemExit(2).
     """
+    os.environ.update(openmp_environment())  # before a command loads torch
     program = "bag_replay" if Path(sys.argv[0]).name == "bag_replay" else PROGRAM
     given = sys.argv[1:] if arguments is None else arguments
     try:

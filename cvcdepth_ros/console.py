@@ -126,6 +126,13 @@ def non_negative(text: str) -> float:
     return number
 
 
+def count(text: str) -> int:
+    """Return the whole number of at least one that an option's text says; for argparse."""
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of at least 1")
+    return int(text)
+
+
 def _line(row: Sequence[str], widths: Sequence[int], numbers: Collection[int]) -> str:
     """Return one row of a table."""
     cells = zip(range(len(row)), row, widths, strict=True)

@@ -14,6 +14,8 @@ from cvcdepth_core.model_choices import DEFAULT, NOTICE, Backend, Precision, che
 
 if TYPE_CHECKING:
     from cvcdepth_core.estimator import DepthEstimator
+    from cvcdepth_core.networks import DepthNetwork
+    from cvcdepth_core.networks.registry import DepthModelSpec
     from cvcdepth_core.pointcloud import CloudLimits
 
 
@@ -54,7 +56,8 @@ class ModelSettings(Settings):
     device: str = "auto"
     """Where inference runs: auto (CUDA where there is one), cpu, cuda, cuda:1 ..."""
     backend: Backend = "auto"
-    """What runs the network: auto (on a CPU ncnn where it is installed, else torch) or one by name."""
+    """What runs the network: auto (on a CPU ncnn, or openvino where it is installed and quicker, else torch) or one by
+    name."""
     precision: Precision = "float32"
     """In what a CUDA device computes; CPUs know float32 only."""
     cpu_fallback: bool = False
@@ -75,22 +78,43 @@ class ModelSettings(Settings):
     def build_estimator(self) -> "DepthEstimator":
         """Return the checkpoint's network, or an untrained one; CheckpointError or ConfigError says what is wrong."""
         from cvcdepth_core.estimator import DepthEstimator
-        from cvcdepth_core.networks.checkpoint import check_sha256
-        from cvcdepth_core.networks.registry import DepthModelSpec
 
         engine = self.model_dump(include={"backend", "precision", "cpu_fallback"})
+        path = self._checked_path()
+        if path is not None:
+            return DepthEstimator.from_checkpoint(path, self.device, **engine)
+        return DepthEstimator.untrained(self._untrained_spec(), self.device, **engine)
+
+    def build_network(self) -> "tuple[DepthNetwork, DepthModelSpec]":
+        """Return that network by itself, and what it is for; raises as `build_estimator`."""
+        from cvcdepth_core.estimator import untrained_network
+        from cvcdepth_core.networks.checkpoint import load_checkpoint
+
+        path = self._checked_path()
+        if path is not None:
+            checkpoint = load_checkpoint(path)
+            return checkpoint.build_depth_net(), checkpoint.spec
+        spec = self._untrained_spec()
+        return untrained_network(spec), spec
+
+    def _checked_path(self) -> Path | None:
+        from cvcdepth_core.networks.checkpoint import check_sha256
+
         path = self.checkpoint_path
         if path is not None:
             check_sha256(path, self.checkpoint_sha256)
-            return DepthEstimator.from_checkpoint(path, self.device, **engine)
+        return path
+
+    def _untrained_spec(self) -> "DepthModelSpec":
+        from cvcdepth_core.networks.registry import DepthModelSpec
+
+        least, greatest = _UNTRAINED_DEPTHS
         try:
-            least, greatest = _UNTRAINED_DEPTHS
-            spec = DepthModelSpec(
+            return DepthModelSpec(
                 encoder=self.encoder, height=self.height, width=self.width, min_depth=least, max_depth=greatest
             )
         except ValidationError as error:
             raise ConfigError(f"parameter {first_validation_message(error)}") from error
-        return DepthEstimator.untrained(spec, self.device, **engine)
 
 
 class MatchingSettings(Settings):

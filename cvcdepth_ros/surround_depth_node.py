@@ -2,10 +2,11 @@
 """`surround_depth_node`: a managed node that turns synchronised camera images into depth images and point clouds."""
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 
-from cvcdepth_ros.live.process_setup import prepare_process
+from cvcdepth_ros.process_setup import openmp_environment, prepare_process
 from cvcdepth_ros.settings import NodeParameters
 
 _HELP = """example:
@@ -24,6 +25,7 @@ _WITHOUT_ROS = (
 def main(args: Sequence[str] | None = None) -> None:
     """Run the node until it is interrupted or terminated."""
     arguments = list(sys.argv if args is None else args)
+    os.environ.update(openmp_environment())  # before rclpy and what follows load torch
     prepare_process()
     try:
         from rclpy.utilities import remove_ros_args

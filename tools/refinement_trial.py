@@ -46,7 +46,7 @@ from cvcdepth_core.refinement.settings import RefinementSettings
 from cvcdepth_core.refinement.visual_odometry import VisualOdometry
 from cvcdepth_core.refinement.without_odometry import RefinerWithoutOdometry
 from cvcdepth_core.rendering.projection import axis_angle_to_rotation
-from cvcdepth_core.rig.calibration import scale_intrinsics
+from cvcdepth_core.rig.pinhole import scale_intrinsics
 from cvcdepth_core.rig.poses import Pose, inverse
 from cvcdepth_core.rig.rig import Rig, load_rig_layout
 from cvcdepth_core.scoring.confidence import CalibrationTable, ConfidenceSamples, confidence_samples, sparsification

@@ -29,12 +29,13 @@ FORMATS = re.compile(r"rosbags|mcap|mcap_\w+")
 """Packages that know how ROS stores messages: those, and no ROS, are for the package around core."""
 
 # From the ground floor up: the room, and the rooms that it may import.
-_GROUND = "errors stamps files model_choices surround_depth"
+_GROUND = "errors stamps files processor model_choices surround_depth"
 
 CORE_ROOMS = {
     "errors": "",
     "stamps": "errors",
     "files": "errors",
+    "processor": "",
     "model_choices": "errors",
     "surround_depth": "",
     "rig": _GROUND,
@@ -53,6 +54,7 @@ CORE_ROOMS = {
 }
 ROS_ROOMS = {
     "installation": "",
+    "process_setup": "installation",
     "settings": "",
     "console": "",
     "recently_used": "",
@@ -61,21 +63,21 @@ ROS_ROOMS = {
     "messages": "bags",
     "surround_sets": "settings messages",
     "recordings": "settings bags kept messages surround_sets",
-    "live": "installation messages surround_sets",
+    "live": "messages surround_sets",
     "checks": "settings bags messages surround_sets recordings",
     "training_data": "settings recently_used bags kept messages surround_sets recordings",
-    "evaluation": "installation settings console bags kept messages surround_sets recordings",
-    "node": "settings bags messages surround_sets live",
+    "evaluation": "installation process_setup settings console bags kept messages surround_sets recordings",
+    "node": "process_setup settings bags messages surround_sets live",
     "simulation": "installation bags messages",
     "finetuning": "installation settings console bags kept surround_sets recordings checks training_data evaluation",
-    "end_to_end": "installation console bags messages surround_sets live node",
-    "bench": "messages surround_sets live node",
+    "end_to_end": "installation process_setup console bags messages surround_sets live node",
+    "bench": "process_setup messages surround_sets live node",
     "reports": "console messages evaluation finetuning",
-    "commands": "installation settings console bags kept messages surround_sets recordings live checks training_data "
-    "evaluation node simulation finetuning end_to_end bench reports",
+    "commands": "installation process_setup settings console bags kept messages surround_sets recordings live checks "
+    "training_data evaluation node simulation finetuning end_to_end bench reports",
     "demo": "installation settings console bags messages surround_sets recordings end_to_end reports",
-    "bag_replay": "installation console commands",
-    "surround_depth_node": "settings live node",
+    "bag_replay": "installation process_setup console commands",
+    "surround_depth_node": "process_setup settings node",
 }
 
 

@@ -21,17 +21,21 @@ _FORWARD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]]
 
 def ring_of_cameras(height: int, width: int) -> RigImages:
     """Return one set, B = 1, of six cameras in a ring with different lenses; all but the last are present."""
-    present = np.arange(CAMERAS) < CAMERAS - 1
+    return RigImages.from_pictures(ring_of_pictures(height, width, present=CAMERAS - 1))
+
+
+def ring_of_pictures(height: int, width: int, present: int = CAMERAS) -> SurroundPictures:
+    """Return the pictures and the calibration of such a ring, of which the first `present` cameras are there."""
+    there = np.arange(CAMERAS) < present
     pictures = np.stack([np.roll(street_like_picture(height, width), 17 * i, axis=1) for i in range(CAMERAS)])
-    pictures[~present] = 0
-    surround = SurroundPictures(
+    pictures[~there] = 0
+    return SurroundPictures(
         pictures=pictures,
-        present=present,
+        present=there,
         intrinsics=np.stack([_intrinsics(height, width, (0.5 + 0.05 * i) * width) for i in range(CAMERAS)]),
         base_T_camera=np.stack([_mount(-2 * math.pi * i / CAMERAS) for i in range(CAMERAS)]),
         valid=np.ones((CAMERAS, height, width), bool),
     )
-    return RigImages.from_pictures(surround)
 
 
 def _intrinsics(height: int, width: int, fx: float) -> NDArray[np.float64]:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -17,15 +18,22 @@ from cvcdepth_core.errors import ConfigError, EngineError
 from cvcdepth_core.model_choices import BACKENDS, Precision
 from cvcdepth_core.networks import DepthNet, DepthNetwork
 from cvcdepth_core.networks.registry import DepthModelSpec
+from cvcdepth_core.processor import instructions
 
 # What has to be importable, and how to get it.
 _PACKAGES = {
     "ncnn": (("ncnn",), "pip install ncnn"),
+    "openvino": (("onnx", "openvino"), "pip install 'cvcdepth_ros[openvino]'"),
     "onnxruntime": (("onnx", "onnxruntime"), "pip install 'cvcdepth_ros[onnx]'"),
     "tensorrt": (("onnx", "onnxruntime"), "pip install onnx onnxruntime-gpu"),
 }
-_CPU_ONLY, _CUDA_ONLY = ("ncnn",), ("torch_compiled", "tensorrt")
+_CPU_ONLY, _CUDA_ONLY = ("ncnn", "openvino"), ("torch_compiled", "tensorrt")
 _HALF_PRECISION = ("torch", "torch_compiled", "tensorrt")
+
+_DEPTHWISE_ENCODERS = ("efficientnet_lite0",)
+_WIDE_VECTORS = "avx512f"
+
+_logger = logging.getLogger(__name__)
 
 
 def build_engine(
@@ -39,10 +47,10 @@ def build_engine(
     """Make the network ready to run, and check that its depth is still the network's.
 
     `device` auto is CUDA where there is one and the backend can use it. `backend` auto is the first of the network's
-    engines that is installed and runs on the device: for the published network on a CPU ncnn, else torch. With
-    `cpu_fallback`, a GPU that fails or is out of memory is replaced by the CPU. Raises ConfigError when the three do
-    not go together or the network has no such engine, EngineError when the engine is not installed or gives another
-    depth.
+    engines that is installed, runs on the device and works: for the published network on a CPU ncnn, or openvino where
+    that is quicker, else torch. With `cpu_fallback`, a GPU that fails or is out of memory is replaced by the CPU.
+    Raises ConfigError when the three do not go together or the network has no such engine, EngineError when the engine
+    is not installed, broken, or gives another depth.
     """
     place = _place(device, backend)
     engine = checked_engine(network, spec, place, backend, precision)
@@ -53,13 +61,29 @@ def build_engine(
 def checked_engine(
     network: DepthNetwork, spec: DepthModelSpec, device: torch.device, backend: str, precision: Precision
 ) -> DisparityEngine:
-    """Return the backend's engine, found to give the network's depth; errors as in `build_engine`."""
-    chosen = _choose(network, spec, device) if backend == "auto" else backend
-    _refuse_unknown_to(network, spec, chosen)
-    _refuse_impossible(chosen, device, precision)
-    _refuse_missing(chosen)
-    engine = _build(chosen, network, spec, device, precision)
-    if chosen != "torch_eager":
+    """Return the backend's engine, found to give the network's depth; errors as in `build_engine`.
+
+    Of `auto`, an engine that is installed but broken is logged, and the next best one taken.
+    """
+    if backend != "auto":
+        return _checked(network, spec, device, backend, precision)
+    *better, last = choices_of_auto(network, spec, device)
+    for chosen in better:
+        try:
+            return _checked(network, spec, device, chosen, precision)
+        except EngineError as error:
+            _logger.warning("backend auto: %s; going on with the next best", error)
+    return _checked(network, spec, device, last, precision)
+
+
+def _checked(
+    network: DepthNetwork, spec: DepthModelSpec, device: torch.device, backend: str, precision: Precision
+) -> DisparityEngine:
+    _refuse_unknown_to(network, spec, backend)
+    _refuse_impossible(backend, device, precision)
+    _refuse_missing(backend)
+    engine = _build(backend, network, spec, device, precision)
+    if backend != "torch_eager":
         check_parity(engine, network, spec, precision)
     return engine
 
@@ -122,8 +146,13 @@ def _place(device: str, backend: str) -> torch.device:
     return torch.device("cpu") if device == "auto" and backend in _CPU_ONLY else resolve_device(device)
 
 
-def _choose(network: DepthNetwork, spec: DepthModelSpec, device: torch.device) -> str:
-    """Return the first of the network's engines that runs here; EngineError says what each of them lacks."""
+def choices_of_auto(network: DepthNetwork, spec: DepthModelSpec, device: torch.device) -> list[str]:
+    """Return those of the network's engines that run here, the best first; EngineError says what each of them lacks.
+
+    A rule, and no measurement when the program starts: that would depend on what else runs, and two programs on one
+    machine (the node, `evaluate`) could take different engines, whose depths differ in the last bits. `cvcdepth bench
+    engines` measures.
+    """
     lacking = {}
     for backend in network.engines:
         place = _only_on(backend)
@@ -131,10 +160,19 @@ def _choose(network: DepthNetwork, spec: DepthModelSpec, device: torch.device) -
             lacking[backend] = f"runs on {place} only"
         elif not is_installed(backend):
             lacking[backend] = f"not installed ({_PACKAGES[backend][1]})"
-        else:
-            return backend
-    reasons = ", ".join(f"{backend} {reason}" for backend, reason in lacking.items())
-    raise EngineError(f"network {spec.kind}: none of its engines can run on '{device}': {reasons}")
+    found = [backend for backend in network.engines if backend not in lacking]
+    if not found:
+        reasons = ", ".join(f"{backend} {reason}" for backend, reason in lacking.items())
+        raise EngineError(f"network {spec.kind}: none of its engines can run on '{device}': {reasons}")
+    return sorted(found, key=lambda backend: backend != "openvino") if _suits_openvino(spec) else found
+
+
+def _suits_openvino(spec: DepthModelSpec) -> bool:
+    """Tell whether OpenVINO is quicker than NCNN, whose Winograd convolutions are what ResNets have most of.
+
+    Measured with AVX-512 only (docs/performance.md).
+    """
+    return spec.encoder in _DEPTHWISE_ENCODERS and _WIDE_VECTORS in instructions()
 
 
 def _only_on(backend: str) -> str | None:
@@ -193,6 +231,10 @@ def _build(
         from cvcdepth_core.engines.ncnn_engine import NcnnEngine
 
         return NcnnEngine(published)
+    if backend == "openvino":
+        from cvcdepth_core.engines.openvino_engine import OpenVinoEngine
+
+        return OpenVinoEngine(published, spec)
     if backend == "tensorrt":
         from cvcdepth_core.engines.onnx_engine import TensorRtEngine
 

@@ -25,7 +25,15 @@ class DepthNet(DepthNetwork):
     """The published network: encoder and decoder with skip connections, every camera's image on its own."""
 
     independent: ClassVar[bool] = True
-    engines: ClassVar[tuple[str, ...]] = ("ncnn", "torch", "torch_compiled", "onnxruntime", "tensorrt", "torch_eager")
+    engines: ClassVar[tuple[str, ...]] = (
+        "ncnn",
+        "openvino",
+        "torch",
+        "torch_compiled",
+        "onnxruntime",
+        "tensorrt",
+        "torch_eager",
+    )
 
     def __init__(self, encoder: str = "resnet18") -> None:
         super().__init__()

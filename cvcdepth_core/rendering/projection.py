@@ -6,7 +6,7 @@ Pixel centres are the integers, u to the right and v down; poses are named `targ
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -139,6 +139,10 @@ class Reprojection(NamedTuple):
         """Take the target's inverse intrinsics [..., 3, 3], the pose [..., 4, 4], and the source's intrinsics."""
         projection = intrinsics @ source_T_target[..., :3, :]
         return cls(projection[..., :3] @ inverse_intrinsics, projection[..., 3:])
+
+    def at(self, index: Any) -> Reprojection:
+        """Return those at an index into the leading dimensions."""
+        return Reprojection(self.turn[index], self.shift[index])
 
     def from_column(self, first: Tensor) -> Reprojection:
         """Return the same for a part of the target image that begins at column `first` [...]."""

@@ -22,8 +22,8 @@ _REACH = 1.5
 """Pixels beyond a source's outermost ones from where its image is still mixed into a view: 1, and some for rounding."""
 _BESIDE = 2
 """Columns beside those that may see something: one for the windows of SSIM, and one for rounding."""
-_WIDTH_STEP = 16
-"""Widths are multiples, so that the buffers of a step fit the next one's."""
+_WIDTHS = 8
+"""Different widths that strips may have, parts of the image's, so that many go through one operation."""
 
 Interval = tuple[int, int]
 """First column, and the one after the last."""
@@ -31,7 +31,7 @@ Interval = tuple[int, int]
 
 @dataclass(frozen=True)
 class Strips:
-    """S strips of one width w, of the images [H, W] of N cameras of which P pairs (target, source) are rendered."""
+    """S strips of one width w, of the images [H, W] of N cameras, in which P pairs (target, source) are rendered."""
 
     cameras: int
     """N."""
@@ -43,40 +43,21 @@ class Strips:
     """[S]."""
     firsts: tuple[int, ...]
     """[S] the first column."""
+    pairs: tuple[int, ...]
+    """[P] which of the rig's pairs these are."""
     strip_of_pair: tuple[int, ...]
-    """[P] the strip of the pair's target in which the pair is rendered."""
+    """[P] the strip of the pair's target that the pair is rendered in."""
 
     @classmethod
     def from_whole_images(cls, targets: Sequence[int], cameras: int, width: int) -> Strips:
-        """Return one strip for every camera, all of its image; `targets` [P]."""
-        return cls(cameras, width, width, tuple(range(cameras)), (0,) * cameras, tuple(targets))
-
-    @classmethod
-    def from_intervals(cls, seen: Sequence[Interval], targets: Sequence[int], cameras: int, width: int) -> Strips:
-        """Return strips that hold the columns `seen` [P] of the pairs' targets; whole images where that saves nothing.
-
-        Pairs of one target that see columns in common share a strip.
-        """
-        pairs = list(zip(targets, seen, strict=True))
-        runs = [(camera, run) for camera in range(cameras) for run in _united(own for t, own in pairs if t == camera)]
-        widest = max(last - first for _, (first, last) in runs)
-        strip_width = -(-widest // _WIDTH_STEP) * _WIDTH_STEP
-        if strip_width >= width or strip_width * len(runs) >= width * cameras:
-            return cls.from_whole_images(targets, cameras, width)
-        place = {(camera, column): i for i, (camera, run) in enumerate(runs) for column in range(*run)}
-        return cls(
-            cameras,
-            width,
-            strip_width,
-            tuple(camera for camera, _ in runs),
-            tuple(min(first, width - strip_width) for _, (first, _) in runs),
-            tuple(place[target, first] for target, (first, _) in pairs),
-        )
+        """Return one strip for every camera, all of its image, for all pairs with these `targets`."""
+        pairs = tuple(range(len(targets)))
+        return cls(cameras, width, width, tuple(range(cameras)), (0,) * cameras, pairs, tuple(targets))
 
     @property
     def are_whole_images(self) -> bool:
         """Whether nothing is left out, one strip after the other being one camera after the other."""
-        return self.width == self.image_width
+        return self.width == self.image_width and self.camera_of_strip == tuple(range(self.cameras))
 
     @property
     def share(self) -> float:
@@ -137,6 +118,40 @@ class Strips:
     def _parts(self, images: Tensor) -> Iterable[Tensor]:
         for camera, first in zip(self.camera_of_strip, self.firsts, strict=True):
             yield images.select(-4, camera).narrow(-1, first, self.width)
+
+
+def divide_into_strips(seen: Sequence[Interval], targets: Sequence[int], cameras: int, width: int) -> list[Strips]:
+    """Return strips, in groups of the same width, that hold the columns `seen` of each pair's target.
+
+    Pairs of one target that see columns in common share a strip. Whole images where strips save nothing.
+    """
+    runs = [
+        (camera, run)
+        for camera in range(cameras)
+        for run in _united(own for target, own in zip(targets, seen, strict=True) if target == camera)
+    ]
+    step = -(-width // _WIDTHS)
+    widths = [min(width, -(-(last - first) // step) * step) for _, (first, last) in runs]
+    if sum(widths) >= width * cameras:
+        return [Strips.from_whole_images(targets, cameras, width)]
+    run_at = {(camera, column): i for i, (camera, run) in enumerate(runs) for column in range(*run)}
+    run_of_pair = [run_at[target, first] for target, (first, _) in zip(targets, seen, strict=True)]
+    groups = []
+    for one_width in sorted(set(widths)):
+        chosen = [i for i, found in enumerate(widths) if found == one_width]
+        pairs = [pair for pair, run in enumerate(run_of_pair) if run in chosen]
+        groups.append(
+            Strips(
+                cameras,
+                width,
+                one_width,
+                tuple(runs[i][0] for i in chosen),
+                tuple(min(runs[i][1][0], width - one_width) for i in chosen),
+                tuple(pairs),
+                tuple(chosen.index(run_of_pair[pair]) for pair in pairs),
+            )
+        )
+    return groups
 
 
 class _Cut(torch.autograd.Function):

@@ -98,8 +98,9 @@ class OptimizerConfig(_Section):
     """Longer gradients are shortened to this."""
     average_decay: float | None = Field(default=None, gt=0, lt=1)
     """Decay per step of the weights' moving average; with it, the average is what is validated and saved."""
-    autocast: Literal["none", "bfloat16"] = "none"
-    """Precision of the networks; views and losses stay in float32."""
+    autocast: Literal["none", "bfloat16", "auto"] = "none"
+    """Precision of the networks; views and losses stay in float32. `auto` is bfloat16 on CPUs that multiply it
+    (AVX512-BF16, AMX) and none elsewhere; a run goes on with what it began with."""
     compile: bool = False
     """Have torch.compile translate the networks at the first step, which takes minutes and a C++ compiler."""
 

@@ -6,17 +6,17 @@ Every sample and camera is reduced on its own, so the loss of a batch is the mea
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
-from cvcdepth_core.rendering.photometric import TargetStatistics, masked_mean, photometric_error, weighted_mean
+from cvcdepth_core.rendering.photometric import TargetStatistics, photometric_error, weighted_mean
 from cvcdepth_core.rendering.projection import Reprojection, back_project, rigid_inverse, transform
-from cvcdepth_core.rendering.strips import Strips, seen_columns
+from cvcdepth_core.rendering.strips import Strips, divide_into_strips, seen_columns
 from cvcdepth_core.rendering.view_synthesis import (
     BlackBeyond,
     KnownView,
@@ -75,27 +75,46 @@ class Prediction:
 
 
 @dataclass(frozen=True)
-class Overlap:
-    """Views of every camera rendered from its neighbours' images, in the columns where these may see something."""
+class OverlapPart:
+    """Strips of the cameras' views rendered from their neighbours' images: S strips of w columns."""
 
     strips: Strips
-    """Where: S strips of w columns."""
-    strip_images: Tensor
+    images: Tensor
     """[B, 1 + F, S, 3, H, w], intensity aligned; frame 0 is spatial, the others spatio-temporal."""
-    strip_masks: Tensor
+    masks: Tensor
     """[B, 1 + F, S, 1, H, w], how much of each pixel a neighbour saw."""
     depth: Tensor | None
-    """[B, N, 1, H, W] the neighbours' depth as metres along this camera's axis, 0 where unknown."""
+    """[B, S, 1, H, w] the neighbours' depth, of dense warping."""
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """Views of every camera rendered from its neighbours' images, in parts: what no neighbour sees is left out."""
+
+    parts: Sequence[OverlapPart]
+    splatted: Tensor | None
+    """[B, N, 1, H, W] the neighbours' depth, of sparse splatting."""
 
     @property
     def images(self) -> Tensor:
         """[B, 1 + F, N, 3, H, W] the whole views."""
-        return self.strips.paste(self.strip_images)
+        return torch.stack([part.strips.paste(part.images) for part in self.parts]).sum(dim=0)
 
     @property
     def masks(self) -> Tensor:
         """[B, 1 + F, N, 1, H, W] their masks."""
-        return self.strips.paste(self.strip_masks)
+        return torch.stack([part.strips.paste(part.masks) for part in self.parts]).sum(dim=0)
+
+    @property
+    def spatial_masks(self) -> Tensor:
+        """[B, N, 1, H, W] those of frame 0."""
+        return torch.stack([part.strips.paste(part.masks[:, 0]) for part in self.parts]).sum(dim=0)
+
+    @property
+    def depth(self) -> Tensor | None:
+        """[B, N, 1, H, W] the neighbours' depth as metres along this camera's axis, 0 where unknown."""
+        warped = [part.strips.paste(part.depth) for part in self.parts if part.depth is not None]
+        return torch.stack(warped).sum(dim=0) if warped else self.splatted
 
 
 @dataclass(frozen=True)
@@ -109,26 +128,22 @@ class Views:
     overlap: Overlap
 
 
-@dataclass(frozen=True)
-class MaskedError:
-    """A term's error map and mask, in strips if it is of the overlap."""
+class MaskedError(NamedTuple):
+    """A term's error map and mask [..., N, 1, H, W], or the strips [..., S, 1, H, w] of them that are not zero."""
 
     error: Tensor
     mask: Tensor
     strips: Strips | None = None
 
-    def mean(self) -> Tensor:
-        """Return the masked mean [..., N] of each camera."""
-        if self.strips is None:
-            return masked_mean(self.error, self.mask)
-        sums = ((self.error * self.mask).sum(_OVER_VIEW), self.mask.sum(_OVER_VIEW))
-        return weighted_mean(*map(self.strips.sum_of_cameras, sums))
+    def sums(self) -> Tensor:
+        """Return the weighted sum and the sum of weights of each camera, [2, ..., N]."""
+        sums = torch.stack([(self.error * self.mask).sum(_OVER_VIEW), self.mask.sum(_OVER_VIEW)])
+        return sums if self.strips is None else self.strips.sum_of_cameras(sums)
 
-    def whole(self) -> tuple[Tensor, Tensor]:
-        """Return error map and mask of the whole images [..., N, 1, H, W]."""
-        if self.strips is None:
-            return self.error, self.mask
-        return self.strips.paste(self.error), self.strips.paste(self.mask)
+    def whole(self) -> Tensor:
+        """Return error map and mask of whole images, [2, ..., N, 1, H, W]."""
+        both = torch.stack([self.error, self.mask])
+        return both if self.strips is None else self.strips.paste(both)
 
 
 @dataclass(frozen=True)
@@ -160,7 +175,7 @@ def evaluate_objective(
             batch = _with_binary_masks(batch)
         views = synthesise_views(batch, prediction, config)
         errors = _masked_errors(batch, prediction, views, config, identity_noise)
-        terms = {name: error.mean() for name, error in errors.items()}
+        terms = {name: weighted_mean(*_added_up(part.sums() for part in parts)) for name, parts in errors.items()}
         if "reconstruction_consistency" in terms:
             terms["reconstruction_consistency"] = terms["reconstruction_consistency"].mean(dim=1)
         if config.smoothness > 0:
@@ -212,29 +227,6 @@ def _synthesise_overlap(
     batch: RigBatch, prediction: Prediction, whole_targets: KnownView, config: ObjectiveConfig
 ) -> Overlap:
     source_T_target = relative_poses(batch.base_T_camera, batch.targets, batch.sources)
-    strips, warp = _warp_neighbours(batch, prediction, source_T_target, config)
-    aligned = align_intensity(
-        warp.images,
-        warp.masks,
-        strips.of_pairs(strips.cut(batch.images))[:, None],
-        strips.of_pairs(strips.cut(batch.masks))[:, None],
-        config.corrected,
-        whole_warped=BlackBeyond(strips.share),
-        whole_target=whole_targets.at((slice(None), None, batch.targets)),
-    )
-    images, masks = strips.sum_of_pairs(aligned), strips.sum_of_pairs(warp.masks)
-    depth = None
-    if config.depth_consistency > 0:
-        depth = _neighbours_depth(batch, prediction, source_T_target, strips, warp, config)
-    if config.corrected:
-        images, masks = images / masks.clamp(min=1), masks.clamp(max=1)
-    return Overlap(strips, images, masks, depth)
-
-
-def _warp_neighbours(
-    batch: RigBatch, prediction: Prediction, source_T_target: Tensor, config: ObjectiveConfig
-) -> tuple[Strips, Warp]:
-    """Render each pair's target from its source at every frame, [B, 1 + F, P, ...], where the source may be seen."""
     standstill = torch.eye(4).to(prediction.motions).expand_as(prediction.motions[:, :1])
     frame_T_target = torch.cat([standstill, prediction.motions], dim=1)[:, :, batch.targets]
     source_of_target = Reprojection.from_cameras(
@@ -242,43 +234,85 @@ def _warp_neighbours(
         source_T_target[:, None] @ frame_T_target,
         batch.intrinsics[:, None, batch.sources],
     )
-    targets = batch.targets.tolist()
     seen = seen_columns(prediction.depth, batch.targets, source_of_target)
-    strips = Strips.from_intervals(seen, targets, batch.cameras, prediction.depth.shape[-1])
-    images = batch.frames[:, :, batch.sources]
-    warp = warp_by_depth(
+    groups = divide_into_strips(seen, batch.targets.tolist(), batch.cameras, prediction.depth.shape[-1])
+    target_T_source = rigid_inverse(source_T_target) if config.depth_consistency > 0 else None
+    parts = []
+    for strips in groups:
+        pairs = list(strips.pairs)
+        warp = _warp_neighbours(
+            batch, prediction, source_of_target.at((slice(None), slice(None), pairs)), strips, config
+        )
+        views = _aligned(batch, whole_targets, strips, warp, config)
+        depth = None
+        if target_T_source is not None and config.depth_warping == "ddcl":
+            depth = _warped_depth(batch, prediction, target_T_source[:, pairs], strips, warp, config)
+        parts.append(OverlapPart(strips, *views, depth))
+    splatted = None
+    if target_T_source is not None and config.depth_warping == "dcl":
+        splatted = _splatted_depth(batch, prediction, target_T_source)
+    return Overlap(parts, splatted)
+
+
+def _warp_neighbours(
+    batch: RigBatch, prediction: Prediction, source_of_target: Reprojection, strips: Strips, config: ObjectiveConfig
+) -> Warp:
+    """Render each pair of the strips from its source at every frame, [B, 1 + F, P, ...]."""
+    sources = batch.sources[list(strips.pairs)]
+    images = batch.frames[:, :, sources]
+    return warp_by_depth(
         depth=strips.of_pairs(strips.cut(prediction.depth))[:, None],
         images=images,
-        masks=batch.masks[:, None, batch.sources].expand_as(images[:, :, :, :1]),
+        masks=batch.masks[:, None, sources].expand_as(images[:, :, :, :1]),
         source_of_target=source_of_target.from_column(strips.first_of_pairs(images)),
         in_front_only=config.corrected,
     )
-    return strips, warp
 
 
-def _neighbours_depth(
+def _aligned(
+    batch: RigBatch, whole_targets: KnownView, strips: Strips, warp: Warp, config: ObjectiveConfig
+) -> tuple[Tensor, Tensor]:
+    """Return what the neighbours show in the strips, with the brightness of the target, and how much of each pixel."""
+    targets = batch.targets[list(strips.pairs)]
+    aligned = align_intensity(
+        warp.images,
+        warp.masks,
+        strips.of_pairs(strips.cut(batch.images))[:, None],
+        strips.of_pairs(strips.cut(batch.masks))[:, None],
+        config.corrected,
+        whole_warped=BlackBeyond(strips.share),
+        whole_target=whole_targets.at((slice(None), None, targets)),
+    )
+    images, masks = strips.sum_of_pairs(aligned), strips.sum_of_pairs(warp.masks)
+    return (images / masks.clamp(min=1), masks.clamp(max=1)) if config.corrected else (images, masks)
+
+
+def _warped_depth(
     batch: RigBatch,
     prediction: Prediction,
-    source_T_target: Tensor,
+    target_T_source: Tensor,
     strips: Strips,
     warp: Warp,
     config: ObjectiveConfig,
 ) -> Tensor:
-    """Bring the neighbours' depth to each camera [B, N, 1, H, W]: z in this camera's frame, 0 where unknown."""
-    targets, sources = batch.targets, batch.sources
-    target_T_source = rigid_inverse(source_T_target)
-    if config.depth_warping == "dcl":
-        points = back_project(prediction.depth, batch.inverse_intrinsics)
-        in_target = transform(target_T_source, points[:, sources])
-        return splat_depth(in_target, batch.masks[:, sources], batch.intrinsics[:, targets], targets, batch.cameras)
+    """Bring the neighbours' depth to the strips [B, S, 1, H, w]: z in this camera's frame, 0 where unknown."""
+    pairs = list(strips.pairs)
+    targets, sources = batch.targets[pairs], batch.sources[pairs]
     target_of_source = Reprojection.from_cameras(
         batch.inverse_intrinsics[:, sources], target_T_source, batch.intrinsics[:, targets]
     )
     warped = sample(target_of_source.z(prediction.depth[:, sources]), warp.grid[:, 0])
     if not config.corrected:
-        return strips.paste(strips.sum_of_pairs(warped))
+        return strips.sum_of_pairs(warped)
     count = strips.sum_of_pairs(warp.masks[:, 0])
-    return strips.paste(strips.sum_of_pairs(warped * warp.masks[:, 0]) / count.clamp(min=1))
+    return strips.sum_of_pairs(warped * warp.masks[:, 0]) / count.clamp(min=1)
+
+
+def _splatted_depth(batch: RigBatch, prediction: Prediction, target_T_source: Tensor) -> Tensor:
+    """Bring the neighbours' points to each camera [B, N, 1, H, W]: z in this camera's frame, 0 in the holes."""
+    targets, sources = batch.targets, batch.sources
+    in_target = transform(target_T_source, back_project(prediction.depth, batch.inverse_intrinsics)[:, sources])
+    return splat_depth(in_target, batch.masks[:, sources], batch.intrinsics[:, targets], targets, batch.cameras)
 
 
 def masked_errors(
@@ -290,38 +324,44 @@ def masked_errors(
     no neighbour can be seen, the error of a term of the overlap is zero.
     """
     errors = _masked_errors(batch, prediction, views, config, identity_noise)
-    return {name: error.whole() for name, error in errors.items()}
+    wholes = {name: _added_up(part.whole() for part in parts) for name, parts in errors.items()}
+    return {name: (error, mask) for name, (error, mask) in wholes.items()}
+
+
+def _added_up(parts: Iterable[Tensor]) -> Tensor:
+    return torch.stack(list(parts)).sum(dim=0)
 
 
 def _masked_errors(
     batch: RigBatch, prediction: Prediction, views: Views, config: ObjectiveConfig, identity_noise: Tensor | None
-) -> dict[str, MaskedError]:
-    target = batch.images[:, None]
+) -> dict[str, list[MaskedError]]:
+    """Return the parts of each term."""
+    target, overlap = batch.images[:, None], views.overlap
     statistics = TargetStatistics.from_images(target)
     reprojection = photometric_error(views.temporal, target, statistics).amin(dim=1)
     auto_masks = auto_mask(reprojection, _identity_error(batch, statistics, identity_noise)) * batch.masks
-    errors = {"temporal": MaskedError(reprojection, auto_masks)} | _overlap_errors(
-        batch, views.overlap, auto_masks, config
-    )
-    depth = views.overlap.depth
+    errors = {"temporal": [MaskedError(reprojection, auto_masks)]}
+    for part in overlap.parts:
+        for name, error in _overlap_errors(batch, part, auto_masks, config).items():
+            errors.setdefault(name, []).append(error)
+    depth = overlap.depth
     if depth is not None:
-        seen = batch.masks * views.overlap.strips.paste(views.overlap.strip_masks[:, 0])
-        mask = batch.masks * _depth_mask(depth, seen, config)
-        errors["depth_consistency"] = MaskedError((depth - prediction.depth).abs(), mask)
+        mask = batch.masks * _depth_mask(depth, batch.masks * overlap.spatial_masks, config)
+        errors["depth_consistency"] = [MaskedError((depth - prediction.depth).abs(), mask)]
     return errors
 
 
 def _overlap_errors(
-    batch: RigBatch, overlap: Overlap, auto_masks: Tensor, config: ObjectiveConfig
+    batch: RigBatch, part: OverlapPart, auto_masks: Tensor, config: ObjectiveConfig
 ) -> dict[str, MaskedError]:
     """Return those of the photometric terms of the overlap."""
-    strips = overlap.strips
+    strips = part.strips
     target, own_masks = strips.cut(batch.images)[:, None], strips.cut(batch.masks)
     statistics = TargetStatistics.from_images(target)
-    frames = [1, overlap.strip_images.shape[1] - 1]
-    spatial, spatio_temporal = overlap.strip_images.split(frames, dim=1)  # type: ignore[no-untyped-call]
-    spatial_mask = own_masks * overlap.strip_masks[:, 0]
-    st_masks = own_masks[:, None] * overlap.strip_masks[:, 1:] * strips.cut(auto_masks)[:, None]
+    frames = [1, part.images.shape[1] - 1]
+    spatial, spatio_temporal = part.images.split(frames, dim=1)  # type: ignore[no-untyped-call]
+    spatial_mask = own_masks * part.masks[:, 0]
+    st_masks = own_masks[:, None] * part.masks[:, 1:] * strips.cut(auto_masks)[:, None]
     errors = {}
     if config.spatial > 0:
         errors["spatial"] = MaskedError(photometric_error(spatial, target, statistics).squeeze(1), spatial_mask, strips)

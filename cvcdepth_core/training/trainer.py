@@ -27,6 +27,7 @@ from tqdm import tqdm
 
 from cvcdepth_core.errors import ConfigError, TrainingError
 from cvcdepth_core.networks.checkpoint import save_checkpoint
+from cvcdepth_core.processor import BFLOAT16, multiplies_bfloat16
 from cvcdepth_core.training.augmentation import draw_flips, jitter_colors
 from cvcdepth_core.training.batch import RigBatch
 from cvcdepth_core.training.config import AugmentationConfig, TrainingConfig
@@ -148,9 +149,12 @@ class Trainer:
         self._skipped_in_a_row = 0
         if config.optimizer.compile:
             _compile(self.model)
+        self.autocast = self._processes.broadcast_from_first(_autocast(config, self._device).encode()).decode()
+        """`none` or `bfloat16`: the precision of the networks."""
         if processes.is_first:
             self._folder.create()
         self._resume()
+        _refuse_slow_bfloat16(self.autocast, self._device)
 
     @property
     def result(self) -> SurroundModel:
@@ -185,6 +189,7 @@ class Trainer:
                 **self._identity.to_state(),
                 "progress": asdict(self.progress),
                 "validations": json.dumps(self.validations),
+                "autocast": self.autocast,
                 "model": self.model.state_dict(),
                 "average": None if self._average is None else self._average.state_dict(),
                 "optimizer": self._optimizer.state_dict(),
@@ -224,6 +229,7 @@ class Trainer:
             self._identity.refuse_other(state, self._folder.state)
             self.progress = Progress(**state["progress"])
             self.validations = json.loads(state["validations"])
+            self.autocast = state.get("autocast", self.autocast)
             self.model.load_state_dict(state["model"])
             self._optimizer.load_state_dict(state["optimizer"])
             if self._average is not None:
@@ -274,6 +280,7 @@ class Trainer:
             "terms": terms,
             "gradient_norm": norm,
             "learning_rate": self._optimizer.param_groups[0]["lr"],
+            "autocast": self.autocast,
             "skipped": self.progress.skipped,
         }
 
@@ -294,7 +301,7 @@ class Trainer:
             for sample in range(self._processes.rank, self._processes.count * len(batch.frames), self._processes.count)
         ]
         seen, depth_flips, pose_flips = _augment(batch, config.augmentation, generators)
-        with torch.autocast(self._device.type, torch.bfloat16, config.optimizer.autocast == "bfloat16"):
+        with torch.autocast(self._device.type, torch.bfloat16, self.autocast == "bfloat16"):
             prediction = self.model(batch, seen, depth_flips, pose_flips)
         value = evaluate_objective(batch, prediction, config.objective, _identity_noise(batch, generators))
         value.per_sample.sum().backward()  # type: ignore[no-untyped-call]
@@ -386,6 +393,21 @@ def _refuse_different_samples(samples: int, processes: Processes) -> None:
         raise TrainingError(
             f"process {processes.rank} has {samples} samples, the first has {first}: the machines do not have the same "
             "recordings"
+        )
+
+
+def _autocast(config: TrainingConfig, device: torch.device) -> str:
+    """Return what a run that begins here takes."""
+    if config.optimizer.autocast != "auto":
+        return config.optimizer.autocast
+    return "bfloat16" if device.type == "cpu" and multiplies_bfloat16() else "none"
+
+
+def _refuse_slow_bfloat16(autocast: str, device: torch.device) -> None:
+    if autocast == "bfloat16" and device.type == "cpu" and not multiplies_bfloat16():
+        raise ConfigError(
+            "optimizer.autocast is bfloat16, or auto and the run began with it, but this CPU does not multiply "
+            f"bfloat16 (no {' or '.join(BFLOAT16)}) and would be slow; go on where one does, or begin anew with none"
         )
 
 

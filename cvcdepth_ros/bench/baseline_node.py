@@ -5,6 +5,12 @@ One callback decodes, rectifies, estimates and publishes a set, everything and o
 is complete. Parameters, topics and messages are those of `surround_depth_node`.
 """
 
+import os
+
+from cvcdepth_ros.process_setup import openmp_environment, prepare_process
+
+os.environ.update(openmp_environment())  # before the imports below load torch
+
 import sys
 from collections import Counter
 from collections.abc import Sequence
@@ -23,7 +29,6 @@ from cvcdepth_core.estimator import SurroundDepthEstimator
 from cvcdepth_core.rig.rig_file import load_rig_layout
 from cvcdepth_ros.bench.baseline_cloud import baseline_cloud
 from cvcdepth_ros.live.mailbox import MailboxStatistics
-from cvcdepth_ros.live.process_setup import prepare_process
 from cvcdepth_ros.messages.conversion import ros_message_class, ros_message_factory, stamp_ns
 from cvcdepth_ros.node.diagnostics import inference_status, synchronisation_status
 from cvcdepth_ros.node.parameters import declare_parameters, read_parameters

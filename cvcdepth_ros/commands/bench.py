@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`bench`: measure the live node on a recording, over DDS, against the baseline node."""
+"""`bench`: measure the live node on a recording, over DDS, against the baseline node; or the engines alone."""
 
 import argparse
 import json
@@ -9,26 +9,34 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cvcdepth_core.errors import RecordingError
+from cvcdepth_core.errors import EngineError, RecordingError
 from cvcdepth_ros.commands.arguments import add_recording, add_rig, add_settings, rig_layout, settings_from
-from cvcdepth_ros.console import positive
+from cvcdepth_ros.console import count, positive, print_result, table
 from cvcdepth_ros.installation import package_version, require_ros
+from cvcdepth_ros.process_setup import prepare_long_work
 from cvcdepth_ros.settings import ModelSettings
 
 if TYPE_CHECKING:
+    from cvcdepth_core.engines.measuring import EngineTimes
     from cvcdepth_core.rig.rig_file import RigLayout
     from cvcdepth_ros.end_to_end.live_run import LiveOutcome
     from cvcdepth_ros.end_to_end.paths import DemoPaths
 
-SUMMARY = """Measure the live node on a recording, over DDS, against the baseline node.
+SUMMARY = """Measure the live node on a recording, over DDS, against the baseline node; or the engines alone.
 
-Player, node and subscriber are processes of their own. The baseline is measured in the same run: a node that decodes,
-estimates (PyTorch, operation by operation) and publishes one set after the other. Prints one line of JSON. A rate at
-which sets are dropped measures throughput, one at which none is measures latency. Needs rclpy."""
+BAG: player, node and subscriber are processes of their own. The baseline is measured in the same run: a node that
+decodes, estimates (PyTorch, operation by operation) and publishes one set after the other. Prints one line of JSON. A
+rate at which sets are dropped measures throughput, one at which none is measures latency. Needs rclpy.
+
+`engines` in the place of BAG: what every engine that is installed takes for six cameras of this network, and which one
+`auto` takes. (A recording of that name is ./engines.)"""
 EXAMPLES: tuple[str, ...] = (
     "bench drive/ --checkpoint model.safetensors",
     "bench drive/ --untrained --height 192 --width 320 --seconds 10 --rate 2",
+    "bench engines --checkpoint model.safetensors --threads 2",
 )
+
+_ENGINES = "engines"
 
 _NODE = "/surround_depth"
 _NODES = {"baseline": "cvcdepth_ros.bench.baseline_node", "node": "cvcdepth_ros.surround_depth_node"}
@@ -43,10 +51,77 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seconds", type=positive, default=10.0, metavar="S", help="recorded seconds to play [10]")
     parser.add_argument("--rate", type=positive, default=1.0, metavar="R", help="how many times real time [1]")
     parser.add_argument("--no-baseline", action="store_true", help="leave the baseline node out")
+    parser.add_argument("--threads", type=count, metavar="N", help="engines: CPU threads [as many as PyTorch takes]")
+    parser.add_argument("--sets", type=count, default=10, metavar="N", help="engines: sets to measure [10]")
+    parser.add_argument("--json", action="store_true", help="engines: print the result as one JSON document")
 
 
 def execute(arguments: argparse.Namespace) -> None:
     """Measure and print."""
+    if arguments.recording == _ENGINES:
+        _measure_engines(arguments)
+    else:
+        _measure_nodes(arguments)
+
+
+def _measure_engines(arguments: argparse.Namespace) -> None:
+    import torch
+
+    from cvcdepth_core.engines import resolve_device
+    from cvcdepth_core.engines.measuring import measure_engines
+
+    model = settings_from(arguments, ModelSettings)
+    prepare_long_work()
+    if arguments.threads:
+        torch.set_num_threads(arguments.threads)
+    network, spec = model.build_network()
+    device = resolve_device(model.device)
+    found = measure_engines(network, spec, device, model.precision, arguments.sets)
+    best = next((engine.backend for engine in found if not engine.problem), None)
+    if best is None:
+        raise EngineError(found[0].problem)
+    result = {
+        "benchmark": "bench engines",
+        "version": package_version(),
+        "machine": _machine(),
+        "network": spec.kind,
+        "size": f"{spec.height}x{spec.width}",
+        "device": str(device),
+        "threads": torch.get_num_threads(),
+        "auto": best,
+        "engines": [_times(one) for one in found],
+    }
+    print_result(result, _engine_text(result), arguments.json)
+
+
+def _times(engine: "EngineTimes") -> dict[str, Any]:
+    if engine.problem:
+        return {"backend": engine.backend, "problem": engine.problem}
+    return {
+        "backend": engine.backend,
+        "engine": engine.name,
+        "ready_s": round(engine.ready_seconds, 2),
+        "median_ms": round(engine.wall_ms, 2),
+        "cpu_ms": round(engine.cpu_ms, 2),
+    }
+
+
+def _engine_text(result: dict[str, Any]) -> str:
+    usable = [engine for engine in result["engines"] if "engine" in engine]
+    rows = [
+        (engine["engine"], *(f"{engine[name]:.1f}" for name in ("ready_s", "median_ms", "cpu_ms"))) for engine in usable
+    ]
+    return "\n".join(
+        [
+            f"{result['network']} {result['size']}, six cameras, {result['device']}, {result['threads']} threads",
+            table(("engine", "ready s", "ms per set", "CPU ms"), rows, numbers=(1, 2, 3)),
+            *(f"{engine['backend']}: {engine['problem']}" for engine in result["engines"] if "problem" in engine),
+            f"auto takes {result['auto']}",
+        ]
+    )
+
+
+def _measure_nodes(arguments: argparse.Namespace) -> None:
     from cvcdepth_ros.bags import open_recording
     from cvcdepth_ros.end_to_end.repeated_recording import write_repeated
     from cvcdepth_ros.recordings.rig import RecordedRig
@@ -140,6 +215,10 @@ def _arrivals(path: Path, topic: str) -> dict[int, int]:
         return {stamp_ns(recording.deserialize(m)): m.log_time for m in recording.messages([topic])}
 
 
+def _machine() -> str:
+    return f"{platform.machine()}, {len(os.sched_getaffinity(0))} cores, load {os.getloadavg()[0]:.1f}"
+
+
 def _result(arguments: argparse.Namespace, model: ModelSettings, found: dict[str, dict[str, Any]]) -> dict[str, Any]:
     import numpy
     import torch
@@ -148,7 +227,7 @@ def _result(arguments: argparse.Namespace, model: ModelSettings, found: dict[str
     return {
         "benchmark": "bench",
         "version": package_version(),
-        "machine": f"{platform.machine()}, {len(os.sched_getaffinity(0))} cores, load {os.getloadavg()[0]:.1f}",
+        "machine": _machine(),
         "versions": {"python": platform.python_version(), "torch": torch.__version__, "numpy": numpy.__version__},
         "recording": str(arguments.recording),
         "rate": arguments.rate,

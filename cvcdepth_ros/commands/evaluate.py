@@ -22,8 +22,9 @@ from cvcdepth_ros.commands.arguments import (
     rig_layout,
     settings_from,
 )
-from cvcdepth_ros.console import paragraph, print_result, progress_bar, table, warn
+from cvcdepth_ros.console import count, paragraph, print_result, progress_bar, table, warn
 from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings, unique_names
+from cvcdepth_ros.process_setup import prepare_long_work
 from cvcdepth_ros.reports import REPORT_FILE, can_draw_report
 
 if TYPE_CHECKING:
@@ -66,7 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_rig(parser)
     add_window(parser)
     parser.add_argument(
-        "--workers", type=_workers, metavar="N", help="processes, a recording each [1; with --ray as many as CPUs]"
+        "--workers", type=count, metavar="N", help="processes, a recording each [1; with --ray as many as CPUs]"
     )
     parser.add_argument("--ray", action="store_true", help="hand the recordings to Ray, on a cluster started here")
     parser.add_argument("--ray-address", metavar="ADDRESS", help="... on the cluster there, as many as its CPUs take")
@@ -86,6 +87,7 @@ def execute(arguments: argparse.Namespace) -> None:
     if arguments.compare:
         content, text = _comparison(*arguments.compare)
     else:
+        prepare_long_work()
         content, text = _evaluation(arguments)
     print_result(content, text, arguments.json)
 
@@ -243,9 +245,3 @@ def _difference_cells(difference: dict[str, float | None], can_prove: bool) -> t
     outside = "different" if can_prove else "too few sets to say"
     verdict = "the same" if low <= 0 <= high else outside
     return (f"{first:.4f}", f"{second:.4f}", f"{change:+.4f}", f"{low:+.4f}..{high:+.4f}", verdict)
-
-
-def _workers(text: str) -> int:
-    if not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of at least 1")
-    return int(text)

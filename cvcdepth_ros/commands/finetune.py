@@ -20,6 +20,7 @@ from cvcdepth_ros.commands.arguments import (
     training_file,
 )
 from cvcdepth_ros.console import print_result, table, warn
+from cvcdepth_ros.process_setup import prepare_long_work
 from cvcdepth_ros.reports import REPORT_FILE, can_draw_report
 
 if TYPE_CHECKING:
@@ -74,6 +75,7 @@ def execute(arguments: argparse.Namespace) -> None:
     from cvcdepth_ros.finetuning.run import BEST_FILE
 
     refuse_unknown_checks(arguments)
+    prepare_long_work()
     config = _training_config(training_file(arguments.config))
     with launched_processes() as processes:
         with_report = processes.is_first and can_draw_report()

@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def execute(arguments: argparse.Namespace) -> None:
     """Play until the end or until interrupted."""
     from cvcdepth_ros.bags import open_recording
-    from cvcdepth_ros.live.process_setup import prepare_process
+    from cvcdepth_ros.process_setup import prepare_process
 
     prepare_process()
     rclpy = _import_rclpy()

@@ -26,6 +26,7 @@ from cvcdepth_ros.commands.arguments import (
 )
 from cvcdepth_ros.console import print_result, progress_bar, table, warn
 from cvcdepth_ros.installation import package_version
+from cvcdepth_ros.process_setup import prepare_long_work
 from cvcdepth_ros.settings import MatchingSettings, MissingCameraSettings, ModelSettings, OutputSettings
 
 if TYPE_CHECKING:
@@ -74,6 +75,8 @@ def execute(arguments: argparse.Namespace) -> None:
     """Run to the end or to Ctrl-C; the output is whole in both cases."""
     settings = settings_from(arguments, RunSettings)
     from cvcdepth_ros.bags import open_recording
+
+    prepare_long_work()
 
     if settings.notice:
         warn(settings.notice)

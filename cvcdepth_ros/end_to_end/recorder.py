@@ -22,10 +22,10 @@ from rclpy.subscription import Subscription
 
 from cvcdepth_core.errors import ConfigError, CvcDepthError
 from cvcdepth_ros.bags import RecordingWriter
-from cvcdepth_ros.live.process_setup import prepare_process
 from cvcdepth_ros.messages.conversion import ros_message_class
 from cvcdepth_ros.messages.node_report import DIAGNOSTICS_TOPIC, read_report
 from cvcdepth_ros.node.qos import SubscriptionEventCallbacks
+from cvcdepth_ros.process_setup import prepare_process
 
 # Room for every message of several sets, so that a moment without the processor loses nothing.
 _QOS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.RELIABLE)

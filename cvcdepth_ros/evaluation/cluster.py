@@ -19,6 +19,7 @@ from cvcdepth_core.errors import ConfigError, CvcDepthError
 from cvcdepth_ros.evaluation.job import Dependencies, EvaluationJob, EvaluationSettings
 from cvcdepth_ros.evaluation.result import Failure
 from cvcdepth_ros.evaluation.workers import Outcome, Pool, evaluate_safely
+from cvcdepth_ros.process_setup import prepare_long_work
 
 _CONNECT_SECONDS = 10.0
 
@@ -129,6 +130,7 @@ def _evaluate_as_here(job: EvaluationJob, expected: Dependencies, folder: Path) 
 
     Relative paths are from `folder`, where the machine has it.
     """
+    prepare_long_work()
     with suppress(OSError):
         os.chdir(folder)
     try:

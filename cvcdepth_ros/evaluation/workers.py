@@ -17,6 +17,7 @@ from cvcdepth_ros.evaluation.job import Dependencies, EvaluationJob
 from cvcdepth_ros.evaluation.measuring import Progress, RecordingScores, evaluate_recording
 from cvcdepth_ros.evaluation.result import Failure
 from cvcdepth_ros.kept import KeptResults, Work
+from cvcdepth_ros.process_setup import prepare_long_work
 
 Outcome = RecordingScores | Failure
 
@@ -149,7 +150,7 @@ def _with_executor(
 
 def _processes(workers: int) -> ProcessPoolExecutor:
     """Return an executor of fresh interpreters: a forked one would inherit torch's threads and CUDA in a bad state."""
-    return ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
+    return ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"), initializer=prepare_long_work)
 
 
 PROCESSES = Pool(_processes, (BrokenProcessPool,), evaluate_safely)

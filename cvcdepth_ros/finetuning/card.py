@@ -58,6 +58,7 @@ def model_card(result: FinetuneResult) -> dict[str, Any]:
             "skipped_steps": trainer.progress.skipped,
             "unreadable_batches": trainer.progress.unreadable,
             "ended_early": trainer.progress.stopped,
+            "autocast": trainer.autocast,
         },
         "configuration": configuration,
         "configuration_sha256": hashlib.sha256(json.dumps(configuration, sort_keys=True).encode()).hexdigest(),

@@ -19,7 +19,6 @@ from cvcdepth_core.errors import CvcDepthError
 from cvcdepth_core.estimator import DepthEstimator
 from cvcdepth_core.rig.rig_file import RigLayout, load_rig_layout
 from cvcdepth_ros.live.problem_log import ProblemLog
-from cvcdepth_ros.live.process_setup import return_memory
 from cvcdepth_ros.live.set_progress import NodeClock
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
 from cvcdepth_ros.node.diagnostics import ERROR, OK, UNKNOWN_LATENCY, WARN, status
@@ -27,6 +26,7 @@ from cvcdepth_ros.node.live_rig import LiveRigDiscovery
 from cvcdepth_ros.node.managed_node import ManagedNode
 from cvcdepth_ros.node.parameters import declare_parameters, read_parameters, unknown_parameters
 from cvcdepth_ros.node.session import SurroundSession
+from cvcdepth_ros.process_setup import return_memory
 from cvcdepth_ros.settings import AUTO, CHANGEABLE_WHILE_RUNNING, NodeParameters
 
 _POLL_SECONDS = 0.25

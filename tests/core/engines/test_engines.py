@@ -3,6 +3,8 @@
 
 import copy
 import json
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import get_args
@@ -12,7 +14,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from cvcdepth_core.engines import build_engine, is_installed, selection
+from cvcdepth_core.engines import build_engine, is_installed, openvino_engine, selection
 from cvcdepth_core.engines.engine import DeviceMemoryError
 from cvcdepth_core.engines.example_rigs import ring_of_cameras
 from cvcdepth_core.engines.guarded_engine import GuardedEngine
@@ -34,9 +36,10 @@ HEIGHT, WIDTH = 64, 96
 CPU = torch.device("cpu")
 CPU_BACKENDS = [
     pytest.param(name, marks=pytest.mark.skipif(not is_installed(name), reason=f"{name} is not installed"))
-    for name in ("torch_eager", "torch", "ncnn", "onnxruntime")
+    for name in ("torch_eager", "torch", "ncnn", "openvino", "onnxruntime")
 ]
 needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+needs_openvino = pytest.mark.skipif(not is_installed("openvino"), reason="onnx or openvino is not installed")
 needs_ncnn = pytest.mark.skipif(not is_installed("ncnn"), reason="ncnn is not installed")
 
 
@@ -167,14 +170,74 @@ def test_the_check_happens_when_an_estimator_is_built(monkeypatch: pytest.Monkey
 
 
 def test_auto_takes_ncnn_where_it_is_installed_and_torch_where_it_is_not(monkeypatch: pytest.MonkeyPatch):
-    network, spec = lively_network("efficientnet_lite0"), spec_of("efficientnet_lite0")
+    network, spec = lively_network("resnet18"), spec_of("resnet18")
     best = "ncnn" if is_installed("ncnn") else "torch"
     assert build_engine(network, spec, "cpu").name.startswith(best)
     monkeypatch.setattr(selection, "find_spec", lambda _: None)
     assert build_engine(network, spec, "cpu").name.startswith("torch ")
 
 
-@pytest.mark.parametrize(("backend", "package"), [("ncnn", "ncnn"), ("onnxruntime", "onnx, onnxruntime")])
+@pytest.mark.parametrize(
+    ("encoder", "flags", "first"),
+    [
+        ("efficientnet_lite0", {"avx2", "avx512f"}, ["openvino", "ncnn", "torch"]),
+        ("efficientnet_lite0", {"avx2"}, ["ncnn", "openvino", "torch"]),
+        ("resnet18", {"avx2", "avx512f"}, ["ncnn", "openvino", "torch"]),
+    ],
+)
+def test_auto_prefers_openvino_where_it_was_found_quicker(
+    encoder: str, flags: set[str], first: list[str], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(selection, "find_spec", lambda _: True)
+    monkeypatch.setattr(selection, "instructions", lambda: frozenset(flags))
+    chosen = selection.choices_of_auto(DepthNet(encoder), spec_of(encoder), CPU)
+    assert chosen == [*first, "onnxruntime", "torch_eager"]
+    assert selection.choices_of_auto(DepthNet(encoder), spec_of(encoder), torch.device("cuda"))[0] == "torch"
+
+
+def test_auto_passes_over_an_engine_that_is_broken_and_says_so_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    def build(backend: str, *others: object) -> object:
+        if backend in ("ncnn", "openvino"):
+            raise EngineError(f"backend {backend}: libc++.so.9: cannot open shared object file")
+        return built(backend, *others)
+
+    built = selection._build
+    monkeypatch.setattr(selection, "_build", build)
+    monkeypatch.setattr(selection, "find_spec", lambda name: name in ("ncnn", "onnx", "openvino") or None)
+    network, spec = lively_network("resnet18"), spec_of("resnet18")
+    assert build_engine(network, spec, "cpu").name.startswith("torch ")
+    assert [record.getMessage() for record in caplog.records] == [
+        f"backend auto: backend {name}: libc++.so.9: cannot open shared object file; going on with the next best"
+        for name in ("ncnn", "openvino")
+    ]
+    with pytest.raises(EngineError, match=r"libc\+\+\.so\.9"):
+        build_engine(network, spec, "cpu", "ncnn")
+
+
+def test_an_openvino_that_cannot_be_imported_is_told_in_one_line(monkeypatch: pytest.MonkeyPatch):
+    def fail(name: str) -> None:
+        raise ImportError(f"lib{name}.so: undefined symbol\n  more about it")
+
+    monkeypatch.setattr(openvino_engine.importlib, "import_module", fail)
+    with pytest.raises(EngineError, match=r"^backend openvino: .*cannot be imported: libopenvino\.so: undefined.*it$"):
+        openvino_engine.OpenVinoEngine(lively_network("resnet18"), spec_of("resnet18"))
+
+
+@needs_openvino
+def test_openvino_is_loaded_without_its_telemetry():
+    script = (
+        "import sys\nfrom cvcdepth_core.engines.openvino_engine import _import_openvino\n"
+        "_import_openvino()\nprint(any(sys.modules[name] for name in sys.modules if 'openvino_telemetry' in name))"
+    )
+    found = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
+    assert found.stdout == "False\n"
+
+
+@pytest.mark.parametrize(
+    ("backend", "package"), [("ncnn", "ncnn"), ("onnxruntime", "onnx, onnxruntime"), ("openvino", "onnx, openvino")]
+)
 def test_an_engine_that_is_not_installed_is_refused_with_the_remedy(
     backend: str, package: str, monkeypatch: pytest.MonkeyPatch
 ):
@@ -186,7 +249,7 @@ def test_an_engine_that_is_not_installed_is_refused_with_the_remedy(
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"backend": "tensorflow"}, "backend is 'tensorflow', expected one of auto, ncnn, torch"),
+        ({"backend": "tensorflow"}, "backend is 'tensorflow', expected one of auto, ncnn, openvino, torch"),
         ({"backend": "tensorrt"}, "backend tensorrt runs on cuda only, the device is 'cpu'"),
         ({"backend": "torch_compiled"}, "backend torch_compiled runs on cuda only"),
         ({"backend": "torch", "precision": "float16"}, "precision float16 needs a CUDA device .* found backend torch"),
@@ -298,12 +361,16 @@ def test_a_batch_that_does_not_fit_into_memory_any_more_is_not_filled_up_again()
     assert len(padded(images[:3])) == len(padded(images[3:])) == 3
 
 
-@needs_ncnn
-def test_ncnn_gives_the_same_depth_on_any_number_of_threads(monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize(
+    "backend", [pytest.param("ncnn", marks=needs_ncnn), pytest.param("openvino", marks=needs_openvino)]
+)
+def test_images_side_by_side_have_the_same_depth_on_any_number_of_threads(
+    backend: str, monkeypatch: pytest.MonkeyPatch
+):
     pictures, found = random_pictures(5), []
     for threads in (1, 4):
         monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
-        engine = build_engine(lively_network("resnet18"), spec_of("resnet18"), "cpu", "ncnn")
+        engine = build_engine(lively_network("resnet18"), spec_of("resnet18"), "cpu", backend)
         one_by_one = torch.cat([engine.disparity(surround_of([picture])) for picture in pictures])
         found += [one_by_one, engine.disparity(surround_of(pictures)), engine.disparity(surround_of(pictures[:2]))]
     assert all(torch.equal(disparity, found[0][: len(disparity)]) for disparity in found)

@@ -11,7 +11,7 @@ from scenes import ring_neighbours, ring_poses
 from torch import Tensor
 
 from cvcdepth_core.rendering.projection import Reprojection, axis_angle_to_rotation, rigid
-from cvcdepth_core.rendering.strips import Strips, seen_columns
+from cvcdepth_core.rendering.strips import Strips, divide_into_strips, seen_columns
 from cvcdepth_core.rendering.view_synthesis import warp_by_depth
 from cvcdepth_core.training.motion import relative_poses
 
@@ -69,27 +69,36 @@ def test_cameras_of_a_ring_see_little_of_each_other_and_strips_leave_the_rest_ou
     depth = 8 + torch.rand(1, 6, 1, HEIGHT, WIDTH, dtype=FLOAT64)
     way, targets = of_neighbours(depth, ring_poses(1, 6), fov=80)
     intervals = seen_columns(depth, targets, way)
-    strips = Strips.from_intervals(intervals, targets.tolist(), 6, WIDTH)
+    groups = divide_into_strips(intervals, targets.tolist(), 6, WIDTH)
     sampled = is_sampled(depth, way, targets).sum(dim=1)
     assert all(last - first <= columns + 8 for (first, last), columns in zip(intervals, sampled, strict=True))
-    assert strips.width < WIDTH / 2
-    assert len(strips.firsts) == len(targets)
+    assert all(strips.width < WIDTH / 2 for strips in groups)
+    assert sum(len(strips.firsts) for strips in groups) == len(targets)
 
 
 def test_pairs_that_see_columns_in_common_share_a_strip_and_others_have_their_own():
-    strips = Strips.from_intervals([(0, 20), (15, 30), (90, 100), (40, 60)], [0, 0, 0, 1], cameras=2, width=100)
-    assert strips.camera_of_strip == (0, 0, 1)
-    assert strips.strip_of_pair == (0, 0, 1, 2)
-    assert strips.width == 32
-    assert strips.firsts == (0, 68, 40)  # the second begins earlier, for it would end beyond the image
+    seen = [(0, 20), (15, 30), (90, 100), (40, 50)]
+    narrow, wide = divide_into_strips(seen, [0, 0, 0, 1], cameras=2, width=100)
+    assert (narrow.width, wide.width) == (13, 39)
+    assert (wide.pairs, wide.strip_of_pair, wide.camera_of_strip, wide.firsts) == ((0, 1), (0, 0), (0,), (0,))
+    # The first begins earlier than what is seen, for it would end beyond the image.
+    assert (narrow.pairs, narrow.camera_of_strip, narrow.firsts) == ((2, 3), (0, 1), (87, 40))
 
 
 def test_strips_that_save_nothing_are_whole_images():
-    strips = Strips.from_intervals([(0, 97), (5, 100)], [0, 1], cameras=2, width=100)
+    (strips,) = divide_into_strips([(0, 97), (5, 100)], [0, 1], cameras=2, width=100)
     images = torch.rand(1, 2, 3, 4, 100)
     assert strips.are_whole_images
     assert strips.cut(images) is images
     assert strips.paste(images) is images
+
+
+def test_one_whole_image_among_narrow_strips_is_a_strip_like_the_others():
+    narrow, whole = divide_into_strips([(0, 100), (90, 100)], [1, 0], cameras=2, width=100)
+    images = torch.rand(1, 2, 3, 4, 100)
+    assert not whole.are_whole_images
+    assert torch.equal(whole.cut(images), images[:, 1:])
+    assert torch.equal(narrow.cut(images), images[:, :1, ..., 87:])
 
 
 def test_a_pair_that_sees_nothing_has_a_strip_all_the_same():
@@ -97,14 +106,14 @@ def test_a_pair_that_sees_nothing_has_a_strip_all_the_same():
     far_apart[0, :, :3, 3] *= 1e6
     depth = torch.ones(1, 3, 1, HEIGHT, WIDTH, dtype=FLOAT64)
     way, targets = of_neighbours(depth, far_apart, fov=20)
-    strips = Strips.from_intervals(seen_columns(depth, targets, way), targets.tolist(), 3, WIDTH)
-    assert strips.width == 16
-    assert len(strips.strip_of_pair) == len(targets)
+    (strips,) = divide_into_strips(seen_columns(depth, targets, way), targets.tolist(), 3, WIDTH)
+    assert strips.width == 10
+    assert strips.pairs == tuple(range(len(targets)))
 
 
 @pytest.mark.parametrize("leading", [(), (2,), (2, 3)])
 def test_cutting_and_pasting_are_each_others_transpose(leading):
-    strips = Strips.from_intervals([(0, 20), (90, 100), (40, 60)], [0, 0, 1], cameras=3, width=100)
+    strips = Strips(3, 100, 32, (0, 0, 1), (0, 68, 40), (0, 1, 2), (0, 1, 2))
     images = torch.rand(*leading, 3, 2, 4, 100, dtype=FLOAT64, requires_grad=True)
     parts = torch.rand(*leading, 3, 2, 4, 32, dtype=FLOAT64, requires_grad=True)
     cut, pasted = strips.cut(images), strips.paste(parts)

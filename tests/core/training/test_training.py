@@ -17,6 +17,7 @@ import torch
 from repository import ROOT
 from scenes import random_batch
 
+from cvcdepth_core import processor
 from cvcdepth_core.errors import CheckpointError, ConfigError, OutputError, TrainingError
 from cvcdepth_core.networks import DepthNet
 from cvcdepth_core.networks.checkpoint import load_checkpoint, save_checkpoint
@@ -319,7 +320,17 @@ def test_an_interrupted_run_leaves_the_last_good_checkpoint(tmp_path):
     assert watched(tmp_path, [], None).progress.step == 4
 
 
-def test_networks_run_in_half_precision_while_the_weights_stay_whole(tmp_path):
+@pytest.fixture
+def with_bfloat16(monkeypatch):
+    monkeypatch.setattr(processor, "instructions", lambda: frozenset({"avx2", "avx512_bf16"}))
+
+
+@pytest.fixture
+def without_bfloat16(monkeypatch):
+    monkeypatch.setattr(processor, "instructions", lambda: frozenset({"avx2"}))
+
+
+def test_networks_run_in_half_precision_while_the_weights_stay_whole(tmp_path, with_bfloat16):
     batches = RandomBatches()
     batches.samples = 1
     run = trainer(tmp_path, batches, epochs=1, autocast="bfloat16", average_decay=None)
@@ -330,6 +341,36 @@ def test_networks_run_in_half_precision_while_the_weights_stay_whole(tmp_path):
     assert seen == [(torch.float32, torch.bfloat16)]
     assert run.progress.skipped == 0
     assert log_of(tmp_path)[0]["loss"] > 0
+
+
+def test_auto_is_what_the_cpu_is_quick_at_and_the_log_says_what_that_was(tmp_path, with_bfloat16):
+    run = trainer(tmp_path, epochs=1, autocast="auto", average_decay=None)
+    run.train(quiet=True)
+    assert run.autocast == "bfloat16"
+    assert {entry["autocast"] for entry in log_of(tmp_path)} == {"bfloat16"}
+    exact = trainer(tmp_path / "exact", epochs=1, average_decay=None)
+    exact.train(quiet=True)
+    losses = zip(log_of(tmp_path), log_of(tmp_path / "exact"), strict=True)
+    assert all(0 < abs(half["loss"] - whole["loss"]) < 0.01 for half, whole in losses)
+
+
+def test_a_run_goes_on_in_the_precision_that_it_began_in(tmp_path, without_bfloat16, monkeypatch):
+    run = trainer(tmp_path, epochs=1, autocast="auto")
+    run.train(quiet=True)
+    assert run.autocast == "none"
+    monkeypatch.setattr(processor, "instructions", lambda: frozenset({"amx_bf16"}))
+    assert trainer(tmp_path, autocast="auto").autocast == "none"
+    assert trainer(tmp_path / "new", autocast="auto").autocast == "bfloat16"
+
+
+def test_bfloat16_is_refused_where_it_would_be_slow(tmp_path, without_bfloat16, monkeypatch):
+    with pytest.raises(ConfigError, match=r"optimizer.autocast is bfloat16.*this CPU does not multiply bfloat16"):
+        trainer(tmp_path, autocast="bfloat16")
+    monkeypatch.setattr(processor, "instructions", lambda: frozenset({"avx512_bf16"}))
+    trainer(tmp_path, epochs=1, autocast="auto").train(quiet=True)
+    monkeypatch.setattr(processor, "instructions", lambda: frozenset({"avx2"}))
+    with pytest.raises(ConfigError, match=r"auto and the run began with it"):
+        trainer(tmp_path, autocast="auto")
 
 
 def test_compiling_without_a_compiler_is_refused_by_what_is_missing(tmp_path, monkeypatch):
