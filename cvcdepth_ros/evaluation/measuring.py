@@ -39,6 +39,7 @@ from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet
 Progress = Callable[[float], None]
 """Called with the share of the recording that is done."""
 
+_REFINED_BY_NS = 4 * NANOSECONDS  # of earlier sets, those that depth is refined with and one more second
 _LONGEST_STEP_NS = NANOSECONDS  # between two sets that are compared along the vehicle's way
 
 
@@ -140,7 +141,12 @@ class RecordingEvaluation:
         self.job = job
         self.replay = SurroundReplay(recorded, job.settings)
         self.truth = RecordedTruth(recorded, job.lidar, job.settings.lidar_tolerance)
-        self.depths = DepthReplay(self.replay, predictor or job.settings.build_predictor(self.replay.rig))
+        self.depths = DepthReplay(
+            self.replay,
+            predictor or job.settings.build_predictor(self.replay.rig),
+            settings=job.settings.replayed,
+            wants_confidence=job.settings.has_confidence,
+        )
 
     @property
     def window(self) -> tuple[int, int]:
@@ -183,7 +189,8 @@ class RecordingEvaluation:
         It is matched anew from shortly before it, by the rig and the network of this evaluation.
         """
         anew = RecordingEvaluation(self.job, self.replay.recorded, self.depths.estimator)
-        for measured in anew.sets(log_time - 2 * NANOSECONDS, log_time + NANOSECONDS, stamp_ns):
+        before = _REFINED_BY_NS if self.depths.refinement.is_active else 2 * NANOSECONDS
+        for measured in anew.sets(log_time - before, log_time + NANOSECONDS, stamp_ns):
             return measured
         raise RecordingError(f"{self.job.path}: no set at {stamp_ns} ns")
 
