@@ -202,6 +202,7 @@ def _outcome(replay: "SurroundReplay", depths: "DepthReplay", written: int, seco
             "refused": depths.refused.count,
         },
         "images": {name: asdict(camera) for name, camera in statistics.cameras.items()},
+        "refinement": depths.refinement.summary(),
         "refused": depths.refused.reasons + replay.unreadable.reasons,
         "seconds": {"total": round(seconds, 3), **{stage: round(total, 3) for stage, total in stages.items()}},
     }
@@ -236,10 +237,21 @@ def _text(result: dict[str, Any]) -> str:
             *(f"note: {note}" for note in result["notes"]),
             f"{sets['written']} sets written of {sets['matched']} matched; {sets['incomplete']} incomplete, "
             f"{sets['refused']} refused",
+            *_refinement_text(result["refinement"]),
             f"{seconds['total']:.1f} s: {stages}",
             f"{result['output']}, by {result['model']}",
         ]
     )
+
+
+def _refinement_text(summary: dict[str, Any] | None) -> list[str]:
+    """Say where the motion came from that pictures were compared by."""
+    if summary is None:
+        return []
+    counts = summary["motion"]
+    told = [f"motion from {counts['odometry']} sets' odometry, {counts['alignment']} sets' pictures"]
+    told = [f"{told[0]}; {counts['unknown']} sets compared with neighbours only"]
+    return told + ([f"odometry not used: {summary['odometry_problem']}"] if summary["odometry_problem"] else [])
 
 
 def _reasons(dropped: dict[str, int]) -> str:

@@ -6,14 +6,15 @@ It is given every set in its order. What it remembers belongs to one rig and one
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import TypeVar
+from typing import Any, TypeVar, get_args
 
 import numpy as np
 
 from cvcdepth_core.estimator import SurroundDepthEstimator
-from cvcdepth_core.refinement.drive import DriveRefiner, RefinedSet
+from cvcdepth_core.refinement.drive import DriveRefiner, MotionSource, RefinedSet
 from cvcdepth_core.refinement.moments import SurroundMoment
 from cvcdepth_core.refinement.settings import RefinementSettings
 from cvcdepth_core.rig.poses import Pose
@@ -53,6 +54,8 @@ class RefinementStage:
         self._follows_always = follows_always
         self._surround: SurroundDepthEstimator | None = None
         self._refiner: DriveRefiner | None = None
+        self._counts: Counter[MotionSource] = Counter()
+        self._odometry_problem = ""
         self.last: RefinedSet | None = None
         """What became of the last set; None where nothing was done."""
 
@@ -66,6 +69,13 @@ class RefinementStage:
         """Whether the next set's pictures are compared; all cameras are needed then."""
         return self._refines or self._follows_always or self._wants_confidence()
 
+    def summary(self) -> dict[str, Any] | None:
+        """Return for how many sets motion was taken from where, with JSON's types; None where nothing was done."""
+        if not self._counts:
+            return None
+        counts = {source: self._counts[source] for source in get_args(MotionSource)}
+        return {"motion": counts, "odometry_problem": self._odometry_problem or None}
+
     def finished(
         self, surround: SurroundDepthEstimator, surround_set: SurroundSet[T], result: SurroundDepth
     ) -> EstimatedSet[T]:
@@ -78,6 +88,8 @@ class RefinementStage:
         with self._latencies.measure("refinement"):
             found = refiner.refine(_moment(surround, surround_set, result, poses))
         self.last = found
+        self._counts[found.source] += 1
+        self._odometry_problem = self._odometry_problem or found.odometry_problem
         depth, confidence = found.depth.depth, found.depth.confidence
         if not self._refines:
             depth, confidence = result.depth, found.depth.prior_confidence
@@ -110,7 +122,5 @@ def _moment(
         valid=surround.preprocessor.valid,
         base_T_camera=np.stack([camera.base_T_camera for camera in surround.rig.cameras]),
         times_ns=np.array([times.get(name, surround_set.time_ns) for name in names], dtype=np.int64),
-        world_T_base=None
-        if poses is None
-        else np.stack([poses.get(name, poses[anchor]) for name in names]),
+        world_T_base=None if poses is None else np.stack([poses.get(name, poses[anchor]) for name in names]),
     )
