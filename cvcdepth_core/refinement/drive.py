@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Refinement along a drive: by recorded motion as long as the pictures agree with it, else by motion from the pictures.
 
-Alignment and odometry watch each other: what odometry tells is compared with what the pictures show, four times a
-second, and odometry that does not fit is named and not used. Where there is none, alignment and refinement take turns.
+What odometry tells is compared with what the pictures show, at first in every set, then about three times a second, and
+odometry that does not fit is named and not used. Where there is none, alignment and refinement take turns.
 """
 
 from __future__ import annotations
@@ -76,6 +76,8 @@ class DriveRefiner:
         self._source: MotionSource = "unknown"
         self._last: SurroundMoment | None = None
         self._watched: SurroundMoment | None = None
+        self._seen: Twist | None = None
+        self._checked_ns: int | None = None
         self._odometry_ns: int | None = None
         self._velocity: NDArray[np.float64] | None = None
 
@@ -85,16 +87,18 @@ class DriveRefiner:
         self._visual.reset()
         self._check = OdometryCheck()
         self._source = "unknown"
-        self._last = self._watched = self._odometry_ns = self._velocity = None
+        self._last = self._watched = self._velocity = self._seen = None
+        self._checked_ns = self._odometry_ns = None
 
     def refine(self, moment: SurroundMoment) -> RefinedSet:
         """Refine the next set; its `world_T_base` is the recorded motion, None where that is not known now."""
         if self._last is not None and moment.time_ns < self._last.time_ns - _SPREAD_NS:
             self.reset()
+        last = self._last
         jump = self._jump(moment)
-        motion = self._followed(moment)
+        motion = self._followed(moment, last)
         problem = self._check.problem() or jump
-        poses, source = self._placed(moment, is_trusted=problem is None)
+        poses, source = self._placed(moment, is_trusted=jump is None and self._check.is_usable())
         if source != self._source and source != "unknown":
             self._refiner.reset()
             self._source = source
@@ -116,23 +120,25 @@ class DriveRefiner:
         self._velocity = None
         return f"odometry jumps: its speed changes by {change:.0f} m/s from one set to the next"
 
-    def _followed(self, moment: SurroundMoment) -> AlignedMotion | None:
-        """Align the set to the one that was kept last, where that is of use; compare with odometry."""
-        if not self._is_to_be_followed(moment):
+    def _followed(self, moment: SurroundMoment, last: SurroundMoment | None) -> AlignedMotion | None:
+        """Align the set to the one before, `last`, where that is of use; compare with odometry."""
+        is_rare = moment.world_T_base is not None and not self._follows_always and self._is_odometry_right()
+        if is_rare and self._checked_ns is not None and moment.time_ns - self._checked_ns < _WATCH_NS:
             return None
         watched, self._watched = self._watched, moment
+        if watched is None or watched is not last:
+            self._visual.reset()
         twist = None if watched is None else _recorded_twist(watched, moment)
-        motion = self._visual.track(moment, twist)
-        if watched is not None and twist is not None and motion is not None and motion.problem is None:
-            middle = (watched.time_ns + moment.time_ns) / 2e9
-            self._check.add(ComparedMotion(middle, motion.twist, twist))
+        motion = self._visual.track(moment, [guess for guess in (twist, self._seen) if guess is not None])
+        if motion is None or motion.problem is not None:
+            return motion
+        self._seen, self._checked_ns = motion.twist, moment.time_ns
+        if watched is not None and twist is not None:
+            self._check.add(ComparedMotion((watched.time_ns + moment.time_ns) / 2e9, motion.twist, twist))
         return motion
 
-    def _is_to_be_followed(self, moment: SurroundMoment) -> bool:
-        has_odometry = moment.world_T_base is not None and self._check.problem() is None
-        if not has_odometry or self._follows_always or self._watched is None:
-            return True
-        return moment.time_ns - self._watched.time_ns >= _WATCH_NS
+    def _is_odometry_right(self) -> bool:
+        return self._check.is_ready and self._check.is_usable()
 
     def _placed(self, moment: SurroundMoment, is_trusted: bool) -> tuple[NDArray[np.float64] | None, MotionSource]:
         """Return world_T_base [N, 4, 4], and from where; odometry that is late by a little is not replaced at once."""

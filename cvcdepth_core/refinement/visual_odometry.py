@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -66,18 +67,17 @@ class VisualOdometry:
         """Forget the set before: after a jump in time, or when the rig has changed."""
         self._last = self._now = None
 
-    def track(self, moment: SurroundMoment, guess: Twist | None = None) -> AlignedMotion | None:
+    def track(self, moment: SurroundMoment, guesses: Sequence[Twist] = ()) -> AlignedMotion | None:
         """Return the motion since the set before; None for the first set and after a gap.
 
-        `guess` is where the search begins beside standstill and the motion before: a pose network's answer, say.
+        `guesses` are where the search begins beside standstill and the motion before: a pose network's answer, say.
         """
         now = AlignedSet.of(moment, self._max_width)
         last = self._last
         if last is None or not 0 < float(now.times.mean()) - last.reference_time <= _LONGEST_GAP:
             self._now = _Now.anew(now)
             return None
-        starts = [start for start in (last.twist, guess) if start is not None]
-        motion = align(now, last.aligned, starts)
+        motion = align(now, last.aligned, [*guesses, *([] if last.twist is None else [last.twist])])
         seconds = float(now.times.mean()) - last.reference_time
         self._now = _Now.anew(now, motion) if motion.problem else _moved(last, now, motion, seconds)
         return motion
