@@ -52,6 +52,8 @@ class RefinedSet:
 
     depth: RefinedDepth
     source: MotionSource
+    world_T_base: NDArray[np.float64] | None
+    """[N, 4, 4] where the vehicle was at each exposure, as it was used; None where that is not known."""
     visual: VisualMotion | None
     """None where the pictures were not followed, or could not be."""
     odometry_problem: str
@@ -104,7 +106,7 @@ class DriveRefiner:
             self._source = source
         refined = self._refiner.refine(replace(moment, world_T_base=poses))
         self._keep(moment, refined, source)
-        return RefinedSet(refined, source, _visual_motion(self._visual, motion, moment), problem or "")
+        return RefinedSet(refined, source, poses, _visual_motion(self._visual, motion, moment), problem or "")
 
     def _jump(self, moment: SurroundMoment) -> str | None:
         """Say that odometry has jumped since the set before, and forget what lies before that."""

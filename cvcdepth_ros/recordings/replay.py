@@ -198,7 +198,7 @@ class DepthReplay:
         self._replay = replay
         self._surround = SurroundDepthEstimator(replay.rig, estimator)
         is_compared = wants_confidence or (settings is not None and settings.refine != "off")
-        self._motion = _set_motion(replay) if is_compared else None
+        self._motion = RecordedSetMotion.of(replay.recorded) if is_compared else None
         self.refinement = RefinementStage(
             settings or ModelSettings.model_validate({"refine": "off"}),
             self._motion.poses_at if self._motion else lambda _: None,
@@ -239,6 +239,11 @@ class DepthReplay:
                 return str(refusals)
         return self._replay.why_no_set(start, stop)
 
+    @property
+    def surround(self) -> SurroundDepthEstimator:
+        """What estimated the last set."""
+        return self._surround
+
     def _finished(
         self, surround: SurroundDepthEstimator, surround_set: SurroundSet[RecordedImage], result: SurroundDepth
     ) -> EstimatedSet[RecordedImage]:
@@ -251,11 +256,6 @@ class DepthReplay:
         if self._surround.rig is not self._replay.rig:
             self._surround = SurroundDepthEstimator(self._replay.rig, self.estimator, self._surround)
         return self._surround
-
-
-def _set_motion(replay: SurroundReplay) -> RecordedSetMotion | None:
-    motion = replay.recorded.vehicle_motion()
-    return None if motion is None else RecordedSetMotion(replay.recording, motion)
 
 
 def _median_distance(anchor: NDArray[np.float64], stamps: NDArray[np.float64]) -> float:

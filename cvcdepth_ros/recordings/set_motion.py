@@ -11,6 +11,7 @@ from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_ros.bags import RecordedMessage, Recording
 from cvcdepth_ros.messages.vehicle_motion import VehicleMotion
 from cvcdepth_ros.recordings.refusals import Refusals
+from cvcdepth_ros.recordings.rig import RecordedRig
 
 _LATE_NS = 300_000_000
 """By how much later than a set a pose is recorded that belongs to it, at most."""
@@ -28,6 +29,12 @@ class RecordedSetMotion:
         self._next: RecordedMessage | None = None
         self.refused = Refusals()
         """Impossible poses, and sets without one."""
+
+    @classmethod
+    def of(cls, recorded: RecordedRig) -> RecordedSetMotion | None:
+        """Return the motion of a rig's recording; None where none is recorded."""
+        motion = recorded.vehicle_motion()
+        return None if motion is None else cls(recorded.recording, motion)
 
     def read_to(self, log_time: int) -> None:
         """Read what belongs to a set whose last image was recorded then (ns)."""

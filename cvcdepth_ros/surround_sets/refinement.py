@@ -86,7 +86,7 @@ class RefinementStage:
         refiner = self._refiner_of(surround)
         poses = self._poses_at(surround_set.times_ns)
         with self._latencies.measure("refinement"):
-            found = refiner.refine(_moment(surround, surround_set, result, poses))
+            found = refiner.refine(moment_of(surround, surround_set, result, poses))
         self.last = found
         self._counts[found.source] += 1
         self._odometry_problem = self._odometry_problem or found.odometry_problem
@@ -106,13 +106,13 @@ class RefinementStage:
         return self._refiner
 
 
-def _moment(
+def moment_of(
     surround: SurroundDepthEstimator,
     surround_set: SurroundSet[T],
     result: SurroundDepth,
     poses: Mapping[str, Pose] | None,
 ) -> SurroundMoment:
-    """Put a set together; of an absent camera, time and pose are another's and mean nothing."""
+    """Put a set together for `DriveRefiner`; of an absent camera, time and pose are another's and mean nothing."""
     times, names, anchor = surround_set.times_ns, surround.rig.names, surround_set.anchor
     return SurroundMoment(
         depth=result.depth,
