@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from cvcdepth_core.rig.calibration import Calibration
 from cvcdepth_core.rig.pinhole import PinholeView, rays_through
 from cvcdepth_core.rig.poses import Pose, check_rigid
+from cvcdepth_core.rig.view import Aspect
 
 MIN_NEIGHBOUR_OVERLAP_DEG = 2.0
 """Cameras whose images share a narrower strip than this are no neighbours: its pixels are too few to learn from."""
@@ -20,7 +21,10 @@ MIN_NEIGHBOUR_OVERLAP_DEG = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """One complete camera; the fields are described in `rig_file.CameraEntry`."""
+    """One complete camera; the fields are described in `rig_file.CameraEntry` and `rig_file.RigLayout`.
+
+    A view of a rig file is applied: R and P of the calibration, and the pose, are those of the view.
+    """
 
     name: str
     calibration: Calibration
@@ -28,6 +32,7 @@ class Camera:
     rectified: bool = False
     mask: Path | None = None
     mask_polygons: tuple[tuple[tuple[float, float], ...], ...] = ()
+    aspect: Aspect = "crop"
 
     def __post_init__(self) -> None:
         check_rigid(self.base_T_camera, f"camera {self.name}: base_T_camera")

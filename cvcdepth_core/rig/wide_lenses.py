@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Views of lenses that see more than one pinhole picture can show: two or three virtual cameras in one place."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+from cvcdepth_core.rig.calibration import Calibration
+from cvcdepth_core.rig.lens import field_of_view
+from cvcdepth_core.rig.rig_file import CameraEntry, RigLayout
+from cvcdepth_core.rig.view import WIDEST_PINHOLE_DEG, View
+
+_SHARED_DEG = 20.0  # by which neighbouring views of a lens overlap
+_WIDEST_PART_DEG = 95.0  # of one of several views
+_MOST_DEG = 3 * _WIDEST_PART_DEG - 2 * _SHARED_DEG
+_SUFFIXES = {2: ("_l", "_r"), 3: ("_l", "_m", "_r")}
+
+
+def is_wide(calibration: Calibration, rectified: bool = False) -> bool:
+    """Whether the lens sees more than one pinhole picture can show."""
+    return field_of_view(calibration, rectified).horizontal > WIDEST_PINHOLE_DEG
+
+
+def views_of(hfov: float) -> tuple[View, ...]:
+    """Return the views, from left to right, that show `hfov` degrees of a lens together: one up to 120 degrees."""
+    if hfov <= WIDEST_PINHOLE_DEG:
+        return (View(hfov=round(hfov, 2)),)
+    whole = min(hfov, _MOST_DEG)
+    count = 2 if whole <= 2 * _WIDEST_PART_DEG - _SHARED_DEG else 3
+    part = math.ceil(10 * (whole + (count - 1) * _SHARED_DEG) / count) / 10
+    outermost = round((whole - part) / 2, 2)
+    step = 2 * outermost / (count - 1)
+    return tuple(View(hfov=part, yaw=round(outermost - step * i, 2)) for i in range(count))
+
+
+def split(entry: CameraEntry, hfov: float) -> tuple[CameraEntry, ...]:
+    """Return the cameras that show `hfov` degrees of the entry's lens: itself, or `<name>_l`, `_m` and `_r`.
+
+    Where the entry names neighbours, its other views are among them too.
+    """
+    views = views_of(hfov)
+    if len(views) == 1:
+        return (entry.model_copy(update={"view": views[0]}),)
+    names = [entry.name + suffix for suffix in _SUFFIXES[len(views)]]
+    return tuple(
+        entry.model_copy(update={"name": name, "view": view, "neighbours": _neighbours(entry, name, names)})
+        for name, view in zip(names, views, strict=True)
+    )
+
+
+def _neighbours(entry: CameraEntry, name: str, names: list[str]) -> tuple[str, ...] | None:
+    if entry.neighbours is None:
+        return None
+    return (*(other for other in names if other != name), *entry.neighbours)
+
+
+def with_views(layout: RigLayout, hfov: Mapping[str, float]) -> RigLayout:
+    """Return the layout with so many degrees shown of the named cameras' lenses, see `split`; the others as they are.
+
+    Anchor and neighbours that are split become the middle view (of two, the left one), and all views.
+    """
+    parts = {c.name: split(c, hfov[c.name]) if c.name in hfov else (c,) for c in layout.cameras}
+    names = {name: [part.name for part in found] for name, found in parts.items()}
+    cameras = tuple(_renamed(part, names) for found in parts.values() for part in found)
+    anchor = layout.anchor and names[layout.anchor][(len(names[layout.anchor]) - 1) // 2]
+    return layout.model_copy(update={"cameras": cameras, "anchor": anchor})
+
+
+def _renamed(entry: CameraEntry, names: Mapping[str, Sequence[str]]) -> CameraEntry:
+    if entry.neighbours is None:
+        return entry
+    others = tuple(new for old in entry.neighbours for new in names.get(old, (old,)))
+    return entry.model_copy(update={"neighbours": others})
