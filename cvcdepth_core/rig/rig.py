@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cvcdepth_core.rig.calibration import Calibration
 from cvcdepth_core.rig.pinhole import PinholeView, rays_through
 from cvcdepth_core.rig.poses import Pose, check_rigid
-from cvcdepth_core.rig.view import Aspect
+from cvcdepth_core.rig.view import Aspect, PicturePart, network_part
 
 MIN_NEIGHBOUR_OVERLAP_DEG = 2.0
 """Cameras whose images share a narrower strip than this are no neighbours: its pixels are too few to learn from."""
@@ -42,6 +42,10 @@ class Camera:
         """The rectified picture at its full size, seen from the camera's place in the base frame."""
         width, height = self.calibration.image_size
         return PinholeView(self.calibration.rectified_intrinsics, self.base_T_camera, height, width)
+
+    def network_part(self, height: int, width: int) -> PicturePart:
+        """Return which part of the rectified picture a network's picture of that size shows."""
+        return network_part(self.calibration, height, width, self.aspect)
 
 
 @dataclass(frozen=True)

@@ -56,7 +56,9 @@ class View(BaseModel):
         """
         if rectified:
             K = calibration.model_copy(update={"k": _rectified_k(calibration)}) if any(calibration.p) else calibration
-            calibration = K.model_copy(update={"distortion_model": "plumb_bob", "d": (), "r": (1.0, 0, 0, 0, 1, 0, 0, 0, 1)})
+            calibration = K.model_copy(
+                update={"distortion_model": "plumb_bob", "d": (), "r": (1.0, 0, 0, 0, 1, 0, 0, 0, 1)}
+            )
         base_R_camera = base_T_camera[:3, :3]
         base_T_view = base_T_camera.copy()
         base_T_view[:3, :3] = _turn_left(self.yaw) @ base_R_camera

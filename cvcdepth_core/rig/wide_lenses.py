@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 from cvcdepth_core.rig.calibration import Calibration
 from cvcdepth_core.rig.lens import field_of_view
@@ -17,9 +17,17 @@ _MOST_DEG = 3 * _WIDEST_PART_DEG - 2 * _SHARED_DEG
 _SUFFIXES = {2: ("_l", "_r"), 3: ("_l", "_m", "_r")}
 
 
-def is_wide(calibration: Calibration, rectified: bool = False) -> bool:
-    """Whether the lens sees more than one pinhole picture can show."""
-    return field_of_view(calibration, rectified).horizontal > WIDEST_PINHOLE_DEG
+def wide_lenses(layout: RigLayout, calibrations: Mapping[str, Calibration]) -> dict[str, float]:
+    """Return the degrees that those lenses see which one pinhole picture cannot show, by the cameras' names.
+
+    Without the cameras of which a view is chosen, and those whose images are rectified already.
+    """
+    lenses = {
+        entry.name: field_of_view(calibrations[entry.name]).horizontal
+        for entry in layout.cameras
+        if entry.view is None and not entry.rectified and entry.name in calibrations
+    }
+    return {name: hfov for name, hfov in lenses.items() if hfov > WIDEST_PINHOLE_DEG}
 
 
 def views_of(hfov: float) -> tuple[View, ...]:
@@ -71,4 +79,44 @@ def _renamed(entry: CameraEntry, names: Mapping[str, Sequence[str]]) -> CameraEn
     if entry.neighbours is None:
         return entry
     others = tuple(new for old in entry.neighbours for new in names.get(old, (old,)))
+    return entry.model_copy(update={"neighbours": others})
+
+
+def without_views(layout: RigLayout, images: Collection[str] | None = None) -> RigLayout:
+    """Return the layout with one camera for each lens and no view chosen: the inverse of `with_views`.
+
+    Of those image topics only, where they are given; the others stay as they are. Of several views' masks and other
+    fields the first one's are kept.
+    """
+    wanted = layout.views_by_image if images is None else {t: layout.views_by_image[t] for t in images}
+    lens_names = {name: lens_name(names) for names in wanted.values() for name in names}
+    cameras = tuple(
+        entry.model_copy(update={"name": lens_names[entry.name], "view": None})
+        if entry.image_topic in wanted
+        else entry
+        for entry in layout.cameras
+        if entry.image_topic not in wanted or entry.name == wanted[entry.image_topic][0]
+    )
+    renamed = {old: [new] for old, new in lens_names.items()}
+    kept = tuple(_without_itself(_renamed(entry, renamed)) for entry in cameras)
+    return layout.model_copy(
+        update={"cameras": kept, "anchor": layout.anchor and lens_names.get(layout.anchor, layout.anchor)}
+    )
+
+
+def lens_name(cameras: Sequence[str]) -> str:
+    """Return what the views of one lens are called together: `front` for front_l, front_m and front_r, else the first.
+
+    A single camera's name is its own.
+    """
+    suffixes = _SUFFIXES.get(len(cameras), ())
+    stems = {name.removesuffix(suffix) for name, suffix in zip(sorted(cameras), suffixes, strict=False)}
+    is_split = len(stems) == 1 and all(map(str.endswith, sorted(cameras), suffixes))
+    return stems.pop() if is_split else cameras[0]
+
+
+def _without_itself(entry: CameraEntry) -> CameraEntry:
+    if entry.neighbours is None:
+        return entry
+    others = tuple(dict.fromkeys(other for other in entry.neighbours if other != entry.name))
     return entry.model_copy(update={"neighbours": others})
