@@ -12,8 +12,8 @@ from cvcdepth_core.rig.rig_file import CameraEntry, RigLayout
 from cvcdepth_core.rig.view import WIDEST_PINHOLE_DEG, View
 
 _SHARED_DEG = 20.0  # by which neighbouring views of a lens overlap
-_WIDEST_PART_DEG = 95.0  # of one of several views
-_MOST_DEG = 3 * _WIDEST_PART_DEG - 2 * _SHARED_DEG
+_WIDEST_OF_TWO_DEG = 140.0  # above it there are three views, and one of them looks straight ahead
+_MOST_DEG = 245.0  # three views of 95 degrees
 _SUFFIXES = {2: ("_l", "_r"), 3: ("_l", "_m", "_r")}
 
 
@@ -35,7 +35,7 @@ def views_of(hfov: float) -> tuple[View, ...]:
     if hfov <= WIDEST_PINHOLE_DEG:
         return (View(hfov=round(hfov, 2)),)
     whole = min(hfov, _MOST_DEG)
-    count = 2 if whole <= 2 * _WIDEST_PART_DEG - _SHARED_DEG else 3
+    count = 2 if whole <= _WIDEST_OF_TWO_DEG else 3
     part = math.ceil(10 * (whole + (count - 1) * _SHARED_DEG) / count) / 10
     outermost = round((whole - part) / 2, 2)
     step = 2 * outermost / (count - 1)

@@ -119,9 +119,9 @@ def check_lenses(context: CheckContext) -> CheckResult:
     if wasted:
         remedy = "`cvcdepth rig BAG --view lens` writes a rig file (--rig) that shows all of each lens"
         return CheckResult("warning", "; ".join(wasted), remedy, values)
-    split = [f"{', '.join(use.cameras)} show a lens of {use.lens:.0f} degrees" for use in uses if len(use.cameras) > 1]
-    widest, narrowest = (pick(uses, key=lambda use: use.lens).lens for pick in (max, min))
-    found = f"{len(uses)} lenses of {narrowest:.0f} to {widest:.0f} degrees, shown whole"
+    angles = sorted({f"{use.lens:.0f}" for use in uses}, key=float)
+    found = f"{len(uses)} of {' to '.join(dict.fromkeys((angles[0], angles[-1])))} degrees, shown whole"
+    split = [f"{use.lens:.0f} degrees by {', '.join(use.cameras)}" for use in uses if len(use.cameras) > 1]
     return CheckResult("passed", "; ".join([found, *split]), values=values)
 
 

@@ -65,12 +65,13 @@ class Lens:
     def _distorted(self, points: Floats) -> Floats:
         """Return the raw pixels [N, 2] of points [N, 3] in the frame of the raw camera."""
         c, origin = self._calibration, np.zeros(3)
+        K = c.raw_intrinsics
         if self._is_fisheye:
             across = np.linalg.norm(points[:, :2], axis=1)
             radii = image_radii(c, np.arctan2(across, points[:, 2]))
             places = points[:, :2] * (radii / np.maximum(across, 1e-12))[:, None]
-            return places * c.raw_intrinsics[[0, 1], [0, 1]] + c.raw_intrinsics[:2, 2]
-        pixels, _ = cv2.projectPoints(np.ascontiguousarray(points[:, None]), origin, origin, c.raw_intrinsics, c.distortion)
+            return places * K[[0, 1], [0, 1]] + K[:2, 2]
+        pixels, _ = cv2.projectPoints(np.ascontiguousarray(points[:, None]), origin, origin, K, c.distortion)
         return np.asarray(pixels, np.float64).reshape(-1, 2)
 
     @cached_property
