@@ -33,6 +33,8 @@ class Camera:
     mask: Path | None = None
     mask_polygons: tuple[tuple[tuple[float, float], ...], ...] = ()
     aspect: Aspect = "crop"
+    lens: str = ""
+    """What those cameras have in common that are views of one lens; empty for a camera with a lens of its own."""
 
     def __post_init__(self) -> None:
         check_rigid(self.base_T_camera, f"camera {self.name}: base_T_camera")
@@ -94,6 +96,14 @@ class Rig:
         computed = {name: [other for other in self.names if frozenset((name, other)) in wide] for name in self.names}
         chosen = {name: self.given_neighbours.get(name, computed[name]) for name in self.names}
         return {name: [other for other in others if other in chosen] for name, others in chosen.items()}
+
+    @property
+    def lenses(self) -> list[list[int]]:
+        """The indices of the cameras of each lens: one, or those that are views of it."""
+        found: dict[str | int, list[int]] = {}
+        for index, camera in enumerate(self.cameras):
+            found.setdefault(camera.lens or index, []).append(index)
+        return list(found.values())
 
     @property
     def neighbour_indices(self) -> list[tuple[int, int]]:

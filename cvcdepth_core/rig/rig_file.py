@@ -163,6 +163,7 @@ class RigLayout(BaseModel):
                     _calibration_of(entry, calibrations or {}),
                     _pose_of(entry, base_T_cameras or {}, self.base_frame),
                     self.aspect,
+                    lens=entry.image_topic if len(self.views_by_image[entry.image_topic]) > 1 else "",
                 )
                 for entry in self.cameras
             ),
@@ -209,12 +210,12 @@ def _check_views(topic: str, cameras: Sequence[CameraEntry]) -> None:
             raise ValueError(f"{field}: differs between {names}, which are views of one lens")
 
 
-def _camera(entry: CameraEntry, calibration: Calibration, base_T_camera: Pose, aspect: Aspect) -> Camera:
+def _camera(entry: CameraEntry, calibration: Calibration, base_T_camera: Pose, aspect: Aspect, lens: str) -> Camera:
     rectified = entry.rectified
     if entry.view is not None:
         calibration, base_T_camera = entry.view.seen_from(calibration, base_T_camera, rectified)
         rectified = False
-    return Camera(entry.name, calibration, base_T_camera, rectified, entry.mask, entry.mask_polygons, aspect)
+    return Camera(entry.name, calibration, base_T_camera, rectified, entry.mask, entry.mask_polygons, aspect, lens)
 
 
 def _calibration_of(entry: CameraEntry, calibrations: Mapping[str, Calibration]) -> Calibration:
