@@ -10,7 +10,7 @@ import numpy as np
 from cvcdepth_core.rig.lens import field_of_view
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.rig.rig_file import CameraEntry, RigLayout
-from cvcdepth_core.rig.wide_lenses import with_views, without_views
+from cvcdepth_core.rig.wide_lenses import from_left_to_right, with_views, without_views
 
 _LEAST_LOSS_DEG, _LEAST_LOSS = 5.0, 0.1
 
@@ -47,7 +47,13 @@ def lens_uses(layout: RigLayout) -> list[LensUse]:
     whole = with_views(lenses, {entry.name: hfov[entry.name] for entry in lenses.cameras if not entry.rectified})
     now, possible = (_widest_overlaps(found) for found in (layout, whole))
     return [
-        LensUse(tuple(names), hfov[entry.name], _used(layout, names, hfov[entry.name]), now[topic], possible[topic])
+        LensUse(
+            from_left_to_right(layout, names),
+            hfov[entry.name],
+            _used(layout, names, hfov[entry.name]),
+            now[topic],
+            possible[topic],
+        )
         for (topic, names), entry in zip(layout.views_by_image.items(), lenses.cameras, strict=True)
     ]
 

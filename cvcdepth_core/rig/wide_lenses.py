@@ -104,6 +104,12 @@ def without_views(layout: RigLayout, images: Collection[str] | None = None) -> R
     )
 
 
+def from_left_to_right(layout: RigLayout, cameras: Collection[str]) -> tuple[str, ...]:
+    """Return the views of one lens in their order."""
+    yaws = {entry.name: entry.view.yaw if entry.view else 0.0 for entry in layout.cameras}
+    return tuple(sorted(cameras, key=lambda name: -yaws[name]))
+
+
 def lens_name(cameras: Sequence[str]) -> str:
     """Return what the views of one lens are called together: `front` for front_l, front_m and front_r, else the first.
 

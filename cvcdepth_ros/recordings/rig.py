@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from cvcdepth_core.errors import RecordingError, RigError, first_validation_message
 from cvcdepth_core.rig.rig_file import CameraEntry, RigLayout
-from cvcdepth_core.rig.wide_lenses import lens_name
+from cvcdepth_core.rig.wide_lenses import from_left_to_right, lens_name
 from cvcdepth_ros.bags import Recording
 from cvcdepth_ros.messages.camera_discovery import (
     CAMERA_INFO_TYPE,
@@ -133,7 +133,8 @@ class RecordedRig:
 def _split_lenses(layout: RigLayout) -> Iterator[str]:
     for names in layout.views_by_image.values():
         if len(names) > 1:
-            yield f"camera {lens_name(names)}: shown by {', '.join(names)}, views of its one lens"
+            views = ", ".join(from_left_to_right(layout, names))
+            yield f"camera {lens_name(names)}: shown by {views}, views of its one lens"
 
 
 def discover_rig(recording: Recording, base_frame: str = "base_link") -> RigLayout:

@@ -70,7 +70,8 @@ class Lens:
             across = np.linalg.norm(points[:, :2], axis=1)
             radii = image_radii(c, np.arctan2(across, points[:, 2]))
             places = points[:, :2] * (radii / np.maximum(across, 1e-12))[:, None]
-            return places * K[[0, 1], [0, 1]] + K[:2, 2]
+            found: Floats = places * K[[0, 1], [0, 1]] + K[:2, 2]
+            return found
         pixels, _ = cv2.projectPoints(np.ascontiguousarray(points[:, None]), origin, origin, K, c.distortion)
         return np.asarray(pixels, np.float64).reshape(-1, 2)
 
@@ -93,7 +94,7 @@ class Lens:
         places = (pixels - K[:2, 2]) / K[[0, 1], [0, 1]]
         radii = np.linalg.norm(places, axis=1)
         angles = angles_at(self._calibration, radii)
-        rays = np.c_[places * (np.sin(angles) / np.maximum(radii, 1e-12))[:, None], np.cos(angles)]
+        rays: Floats = np.c_[places * (np.sin(angles) / np.maximum(radii, 1e-12))[:, None], np.cos(angles)]
         self._check(pixels, rays)
         return rays
 
