@@ -99,6 +99,8 @@ class CheckContext:
         """Of each topic that may be a camera's; of CameraInfos where there is a rig file."""
         layout = self._chosen_layout(rig_layout)
         self.assembler = None if layout is None else self._assembled(messages, layout)
+        if self.assembler is not None and not self.has_rig_file:
+            self.assembler.split_wide_lenses()
         """None where the cameras make no rig, or the transforms contradict each other."""
         self.lidars = messages.lidars if options.lidar is None else options.lidar
         """The topics of the LiDARs."""
@@ -169,11 +171,13 @@ class CheckContext:
         sets = self.match(self.layout, self.options.tolerance)
         topics = {camera.name: camera.image_topic for camera in self.layout.cameras}
         for found in (sets[len(sets) * (2 * i + 1) // (2 * _SHOWN_SETS)] for i in range(min(_SHOWN_SETS, len(sets)))):
-            wanted = {(topics[camera], log_time): camera for camera, log_time in found.images.items()}
+            wanted: dict[tuple[str, int], list[str]] = defaultdict(list)
+            for camera, log_time in found.images.items():
+                wanted[topics[camera], log_time].append(camera)
             times = found.images.values()
             messages = self.recording.messages(set(topics.values()), min(times), max(times) + 1)
             read = {
-                wanted[key]: message for message in messages if (key := (message.topic, message.log_time)) in wanted
+                camera: message for message in messages for camera in wanted.get((message.topic, message.log_time), ())
             }
             pictures = {camera: self._picture(camera, message) for camera, message in read.items()}
             yield {camera: picture for camera, picture in pictures.items() if not isinstance(picture, str)}

@@ -33,8 +33,9 @@ if TYPE_CHECKING:
 
 SUMMARY = """Check whether recordings and a rig will work, with a remedy for what will not.
 
-Twelve numbered checks: cameras, calibrations, transforms, stamps, sets, overlaps, masks, LiDAR, motion, encodings,
-brightness, and whether two cameras were swapped. The exit code is 1 when a check failed; warnings leave it at 0."""
+Thirteen numbered checks: cameras, calibrations, transforms, stamps, sets, overlaps, masks, LiDAR, motion, encodings,
+brightness, whether two cameras were swapped, and how much of its lens each shows. The exit code is 1 when a check
+failed; warnings leave it at 0."""
 EXAMPLES: tuple[str, ...] = (
     "check drive.mcap",
     "check drives/ --rig rig.yaml --tolerance 0.05 --lidar /lidar/points --json",

@@ -74,10 +74,11 @@ class MeasuredSet:
         rig, depth = self.estimated.rig, self.estimated.result.depth
         views = {camera.name: camera.rectified_view for camera in rig.cameras}
         found = []
-        for name, truth, prediction in zip(rig.names, self.truth, depth, strict=True):
-            others = [views[other] for other in rig.neighbours[name]]
-            overlap = overlap_pixels(truth, views[name], others)
-            found.append(DepthSamples(sample_prediction(prediction, truth), truth.depth, overlap))
+        for camera, truth, prediction in zip(rig.cameras, self.truth, depth, strict=True):
+            others = [views[other] for other in rig.neighbours[camera.name]]
+            overlap = overlap_pixels(truth, views[camera.name], others)
+            sampled = sample_prediction(prediction, truth, camera.network_part(*prediction.shape))
+            found.append(DepthSamples(sampled, truth.depth, overlap))
         return found
 
 

@@ -11,7 +11,7 @@ import queue
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, wait
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ from cvcdepth_ros.live.mailbox import Mailbox
 from cvcdepth_ros.live.picture_preparation import CameraImage, PicturePreparer
 from cvcdepth_ros.messages.conversion import stamp_ns
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
-from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet, usable_pictures
+from cvcdepth_ros.surround_sets.set_estimation import EncodedImage, EstimatedSet, usable_pictures
 from cvcdepth_ros.surround_sets.synchronizer import SurroundSet, SurroundSynchronizer
 
 _JOIN_SECONDS = 1.0
@@ -120,14 +120,17 @@ class SurroundPipeline:
             self._use(built)
         self._estimator = estimator
 
-    def add(self, camera: str, message: Any) -> None:
-        """Take an image message in; quick, for whoever receives them all."""
+    def add(self, cameras: Sequence[str], message: Any) -> None:
+        """Take an image message in, of a camera or of all that are views of one lens; quick, for who receives all."""
         stamp = stamp_ns(message)
-        if not self._watches[camera].accept(stamp, message.data):
-            return
-        image = CameraImage(camera, message, self._latencies)
+        image = EncodedImage(message, is_shared=len(cameras) > 1)
+        for camera in cameras:
+            if self._watches[camera].accept(stamp, message.data):
+                self._add(CameraImage(camera, image, self._latencies), stamp)
+
+    def _add(self, image: CameraImage, stamp: int) -> None:
         self._prepare_ahead(image)
-        for surround_set in self._synchroniser.add(camera, stamp, image):
+        for surround_set in self._synchroniser.add(image.camera, stamp, image):
             self._mailbox.put(surround_set)
 
     def close(self) -> bool:

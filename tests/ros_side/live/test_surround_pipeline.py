@@ -27,7 +27,7 @@ from cvcdepth_ros.live.picture_preparation import CameraImage
 from cvcdepth_ros.live.pipeline import SurroundPipeline
 from cvcdepth_ros.recordings.rig import discover_rig
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
-from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet, estimate_set, picture_or_error
+from cvcdepth_ros.surround_sets.set_estimation import EncodedImage, EstimatedSet, estimate_set, picture_or_error
 from cvcdepth_ros.surround_sets.synchronizer import SurroundSynchronizer
 
 TIMEOUT = 60.0
@@ -103,7 +103,7 @@ class Running:
 
     def feed(self, images: list[tuple[str, Any]]) -> None:
         for camera, message in images:
-            self.pipeline.add(camera, message)
+            self.pipeline.add([camera], message)
 
     def wait(self, condition: Callable[[], object]) -> None:
         deadline = time.monotonic() + TIMEOUT
@@ -420,7 +420,7 @@ class TooWide(Rectifier):
 def test_what_opencv_raises_costs_one_image_and_names_its_camera(layout, images):
     camera, message = images[0]
     calibration = next(c.calibration for c in layout.cameras if c.name == camera)
-    outcome = picture_or_error(message, camera, TooWide(calibration, 96, 160), StageLatencies())
+    outcome = picture_or_error(EncodedImage(message), camera, TooWide(calibration, 96, 160), StageLatencies())
     assert isinstance(outcome, ImageError)
     assert str(outcome).startswith(f"camera {camera}: error: OpenCV")
 
