@@ -12,7 +12,7 @@ from sensor_msgs.msg import CameraInfo
 
 from cvcdepth_core.errors import CvcDepthError
 from cvcdepth_core.rig.rig_file import CameraEntry, RigLayout
-from cvcdepth_ros.messages.camera_discovery import COMPRESSED_IMAGE_TYPE, IMAGE_TYPE, discover_cameras
+from cvcdepth_ros.messages.camera_discovery import RECORDED_IMAGE_TYPES, discover_cameras
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
 from cvcdepth_ros.messages.transforms import TransformTree
 from cvcdepth_ros.node.subscriptions import StaticTransformInput, topic_types
@@ -96,7 +96,7 @@ class LiveRigDiscovery:
         own = f"{self._node.get_fully_qualified_name()}/"
         types = {topic: names[0] for topic, names in topic_types(self._node).items() if not topic.startswith(own)}
         entries = tuple(discover_cameras(types))
-        images = {topic for topic, name in types.items() if name in (IMAGE_TYPE, COMPRESSED_IMAGE_TYPE)}
+        images = {topic for topic, name in types.items() if name in RECORDED_IMAGE_TYPES}
         self._unpaired = sorted(topic for topic in images if not _has_info(topic, types))
         if entries == self._entries:
             return

@@ -57,7 +57,7 @@ def _opened_by(process: Path) -> Iterator[Path]:
         return
     for descriptor in descriptors:
         try:
-            path = Path(os.readlink(descriptor))
+            path = descriptor.readlink()
         except OSError:  # closed meanwhile
             continue
         if _is_of_dds(path):
@@ -75,7 +75,7 @@ def _segment(path: Path) -> str:
 
 
 def _is_locked(path: Path) -> bool:
-    """Whether a process holds the file's lock, maybe one of a container that shares the memory and not the processes."""
+    """Whether somebody holds the file's lock, maybe in a container that shares the memory and not the processes."""
     try:
         with path.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
