@@ -14,7 +14,9 @@ KEY_EVERY = 6
 ENCODERS = {"h264": "libx264", "hevc": "libx265"}
 
 
-def encoded(pictures: Sequence[NDArray[np.uint8]], codec: str, b_frames: int = 0, key_every: int = KEY_EVERY) -> list[bytes]:
+def encoded(
+    pictures: Sequence[NDArray[np.uint8]], codec: str, b_frames: int = 0, key_every: int = KEY_EVERY
+) -> list[bytes]:
     """One packet for each BGR picture."""
     context = av.CodecContext.create(ENCODERS[codec], "w")
     context.height, context.width = pictures[0].shape[:2]

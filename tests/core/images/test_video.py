@@ -11,7 +11,6 @@ from video_packets import ENCODERS, KEY_EVERY, encoded
 from cvcdepth_core.errors import ImageError
 from cvcdepth_core.images.video import VideoDecoder, codec_of, is_key_frame
 
-
 NOISE = np.random.default_rng(0).integers(0, 255, (240, 64), np.uint8).repeat(5, axis=1)
 TALL = [np.roll(NOISE, 3 * number, 1)[..., None].repeat(3, 2) for number in range(4)]
 """High enough to be sent in slices."""
