@@ -76,7 +76,7 @@ class LiveRigDiscovery:
         first, *others = problems.values()
         more = f" (and so for {len(others)} more of {len(self._entries)} cameras)" if others else ""
         is_pose = self._assembler is not None and self._assembler.calibration_problem(next(iter(problems))) is None
-        remedy = f"; publish it on /tf_static, base_frame is {self._base_frame}" if is_pose else ""
+        remedy = f"; publish it on /tf_static; the parameter base_frame is {self._base_frame}" if is_pose else ""
         return f"{first}{more}{remedy}"
 
     def _hint(self) -> str:
