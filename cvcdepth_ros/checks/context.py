@@ -20,6 +20,7 @@ from cvcdepth_core.stamps import exposure_times
 from cvcdepth_ros.bags import RecordedMessage, Recording
 from cvcdepth_ros.messages.camera_discovery import RECORDED_IMAGE_TYPES
 from cvcdepth_ros.messages.conversion import picture_from_message
+from cvcdepth_ros.messages.recorded_changes import CalibrationHistory
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
 from cvcdepth_ros.recordings.motion import VehicleMotion, find_motion_link
 from cvcdepth_ros.recordings.refusals import Refusals
@@ -111,6 +112,8 @@ class CheckContext:
         """Impossible poses."""
         self.timings: dict[str, TopicTiming] = {}
         """Of the topics with images and LiDAR sweeps."""
+        self.calibrations = self._followed_calibrations()
+        """What the CameraInfos say; None where a rig file says it, or there are no cameras."""
         self.images: list[ImageTimes] = []
         """Every image, in the order of recording."""
         self.sweeps: dict[str, list[Any]] = defaultdict(list)
@@ -204,13 +207,21 @@ class CheckContext:
         link = find_motion_link(self.recording, self.assembler.layout.base_frame, self.assembler.transforms)
         return None if link is None else VehicleMotion(link)
 
+    def _followed_calibrations(self) -> CalibrationHistory | None:
+        if self.has_rig_file or self.assembler is None:
+            return None
+        return CalibrationHistory(self.recording, self.assembler.layout, self.first_messages)
+
     def _read(self, progress: Callable[[int], None] | None) -> None:
         cameras = self._cameras_by_topic()
         moving = [self.motion.topic] if self.motion else []
-        topics = {*cameras, *self.lidars, *moving} & self.recording.topics.keys()
+        infos = self.calibrations.topics if self.calibrations else set()
+        topics = {*cameras, *self.lidars, *moving, *infos} & self.recording.topics.keys()
         for message in self.recording.messages(topics, self.options.start, self.options.stop):
             if message.topic in moving:
                 self._add_motion(message)
+            elif self.calibrations and message.topic in infos:
+                self.calibrations.add(message)
             else:
                 self._add_stamped(message, cameras.get(message.topic, ()))
             if progress:

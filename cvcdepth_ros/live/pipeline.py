@@ -4,7 +4,7 @@
     receive (caller) -> decode and rectify (pool) -> estimate (one thread, newest set wins) -> publish (one thread)
 
 Nothing piles up: of each camera one image waits to be decoded, one set to be estimated, one estimate to be published.
-What nobody wants is not computed.
+What nobody wants is not computed, but for packets of video, which are all decoded beside that (`video_streams`).
 """
 
 import queue
@@ -26,7 +26,8 @@ from cvcdepth_core.rig.rig import Rig
 from cvcdepth_ros.live.camera_states import CameraWatch
 from cvcdepth_ros.live.mailbox import Mailbox
 from cvcdepth_ros.live.picture_preparation import CameraImage, PicturePreparer
-from cvcdepth_ros.messages.conversion import stamp_ns
+from cvcdepth_ros.live.video_streams import VideoImage, VideoStreams
+from cvcdepth_ros.messages.conversion import is_video_packet, stamp_ns
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
 from cvcdepth_ros.surround_sets.set_estimation import EncodedImage, EstimatedSet, usable_pictures
 from cvcdepth_ros.surround_sets.synchronizer import SurroundSet, SurroundSynchronizer
@@ -78,6 +79,7 @@ class SurroundPipeline:
         self._pace = _InferencePace()
         self._warming = threading.Lock()
         self._warm: DepthPredictor | None = None
+        self._videos = VideoStreams()
         self._preparer = PicturePreparer(len(watches))
         self._estimates: queue.Queue[EstimatedSet[CameraImage] | None] = queue.Queue(maxsize=1)
         self.problem = ""
@@ -121,11 +123,13 @@ class SurroundPipeline:
         self._estimator = estimator
 
     def add(self, cameras: Sequence[str], message: Any) -> None:
-        """Take an image message in, of a camera or of all that are views of one lens; quick, for who receives all."""
-        stamp = stamp_ns(message)
+        """Take an image message or a packet of video in, of a camera or of all that are views of one lens; quick."""
+        stamp, content = stamp_ns(message), message.data
+        if is_video_packet(message):
+            message = self._video_image(cameras, message)  # whatever becomes of it, later packets are built on it
         image = EncodedImage(message, is_shared=len(cameras) > 1)
         for camera in cameras:
-            if self._watches[camera].accept(stamp, message.data):
+            if self._watches[camera].accept(stamp, content) and message is not None:
                 self._add(CameraImage(camera, image, self._latencies), stamp)
 
     def _add(self, image: CameraImage, stamp: int) -> None:
@@ -133,9 +137,18 @@ class SurroundPipeline:
         for surround_set in self._synchroniser.add(image.camera, stamp, image):
             self._mailbox.put(surround_set)
 
+    def _video_image(self, cameras: Sequence[str], packet: Any) -> VideoImage | None:
+        try:
+            return self._videos.take(cameras[0], packet)
+        except ImageError as error:
+            for camera in cameras:
+                self._watches[camera].used(str(error))
+            return None
+
     def close(self) -> bool:
         """Stop; False when a thread is still inside its last set a second later."""
         self._mailbox.close()
+        self._videos.close()
         self._preparer.close()
         deadline = time.monotonic() + _JOIN_SECONDS
         for thread in self._threads:
