@@ -326,8 +326,8 @@ class Trainer:
         """Turn the gradients' sum into the mean of all processes and shorten it if configured; return its length."""
         self._processes.sum_gradients_over_processes(list(self.model.parameters()))
         for parameter in self.model.parameters():
-            if parameter.grad is not None:
-                parameter.grad /= max(samples, 1)
+            if parameter.grad is not None and samples > 1:
+                parameter.grad /= samples
         limit = self.config.optimizer.max_gradient_norm or math.inf
         return float(nn.utils.clip_grad_norm_(self.model.parameters(), limit))
 

@@ -133,9 +133,10 @@ class SurroundPipeline:
                 self._add(CameraImage(camera, image, self._latencies), stamp)
 
     def _add(self, image: CameraImage, stamp: int) -> None:
-        self._prepare_ahead(image)
+        self._prepare_ahead([image])
         for surround_set in self._synchroniser.add(image.camera, stamp, image):
             self._mailbox.put(surround_set)
+            self._prepare_ahead(surround_set.images.values())
 
     def _video_image(self, cameras: Sequence[str], packet: Any) -> VideoImage | None:
         try:
@@ -163,15 +164,21 @@ class SurroundPipeline:
         if former is not None:
             former.cancel()  # whoever sends new calibrations faster than maps can be built piles nothing up
 
-    def _prepare_ahead(self, image: CameraImage) -> None:
+    def _prepare_ahead(self, images: Iterable[CameraImage]) -> None:
+        """Have pictures made while the network works on another set.
+
+        An image whose set will be replaced before the network is free need not be decoded. When it arrives, that is
+        not known yet; when its set is complete, what comes next is a camera's interval away.
+        """
         build = self._build
         surround = _surround_of(build) if build is not None and build.done() else None
-        if surround is None or not self._needed([image.camera], surround):
+        if surround is None:
             return
-        rectifier = surround.preprocessor.rectifiers.get(image.camera)
-        # An image whose set will be replaced before the network is free need not be decoded.
-        if rectifier is not None and self._pace.is_free_within(self._watches[image.camera].interval):
-            self._preparer.prepare(image, rectifier)
+        rectifiers = surround.preprocessor.rectifiers
+        soon = {i.camera: i for i in images if self._pace.is_free_within(self._watches[i.camera].interval)}
+        for camera in self._needed(soon, surround):
+            if camera in rectifiers:
+                self._preparer.prepare(soon[camera], rectifiers[camera])
 
     def _build_and_warm_up(self, rig: Rig, estimator: DepthPredictor) -> _Build:
         build = self._build_surround(rig, estimator)

@@ -196,6 +196,28 @@ def test_images_are_decoded_while_the_network_is_busy_with_the_set_before(start,
     assert not running.published
 
 
+def test_a_complete_set_is_decoded_where_the_network_will_be_free_before_the_next(
+    start, estimator, images, monkeypatch: pytest.MonkeyPatch
+):
+    """When its images came, the network was busy for longer than the next ones would need to come."""
+    slowed = Slowed(estimator)
+    running = start(slowed)
+    left = iter(images)
+
+    def feed_until(sets: int) -> None:
+        while running.mailbox.statistics().received < sets:
+            running.feed([next(left)])
+
+    is_free = lambda _: running.mailbox.statistics().received >= 2  # noqa: E731
+    monkeypatch.setattr(running.pipeline._pace, "is_free_within", is_free)
+    feed_until(sets=1)
+    assert slowed.entered.wait(TIMEOUT)
+    assert running.latencies.summaries()["preprocess"].count == 6
+    feed_until(sets=2)
+    running.wait(lambda: running.latencies.summaries()["preprocess"].count == 12)
+    assert not running.published
+
+
 def test_only_wanted_cameras_are_decoded_and_estimated(start, estimator, images):
     slowed = Slowed(estimator)
     slowed.gate.set()
