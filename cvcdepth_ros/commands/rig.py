@@ -7,11 +7,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
-from cvcdepth_core.errors import ConfigError
+from cvcdepth_core.errors import ConfigError, RigError
 from cvcdepth_core.rig.view import Aspect
 from cvcdepth_ros.commands.arguments import add_json, add_recording, add_rig, refuse_to_overwrite, rig_layout
-from cvcdepth_ros.console import print_result, table, warn
+from cvcdepth_ros.console import print_result, progress_bar, table, warn
 from cvcdepth_ros.installation import package_version
+from cvcdepth_ros.process_setup import prepare_long_work
 
 if TYPE_CHECKING:
     from cvcdepth_core.rig.rig import Camera, Rig
@@ -25,7 +26,8 @@ SUMMARY = """Write a rig file from a recording.
 Finds the cameras, takes their calibrations from camera_info and their poses from /tf_static, orders them
 counter-clockwise around the vehicle from the front one, and computes which of them see the same space. With --masks it
 finds where a camera sees the vehicle itself, which stands still in the picture while the scene moves, and writes a PNG
-for it beside the rig file. With --rig, a file that names the cameras only (config/rigs/) is completed.
+for it beside the rig file. With --rig, a file that names the cameras only (config/rigs/) is completed. With --refine,
+the pictures themselves tell how the cameras are turned: small rotations that make neighbours agree where they overlap.
 
 With --view the cameras show so much of their lenses, whatever P of camera_info says. A lens of more than 120 degrees is
 shown by two or three virtual cameras, NAME_l, NAME_m and NAME_r."""
@@ -34,7 +36,11 @@ EXAMPLES: tuple[str, ...] = (
     "rig drive/ -o rigs/shuttle.yaml --base-frame base_footprint --anchor front",
     "rig drive.mcap --view lens",
     "rig drive.mcap --view 98 --view back=170 --aspect pad",
+    "rig drive/ --rig rigs/shuttle.yaml --refine -o rigs/shuttle_refined.yaml",
 )
+
+
+_PARTS, _PART_SECONDS = 4, 2.5  # of the recording, that neighbours are compared in
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -54,6 +60,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="how pictures come into a network of another shape: cut off, with empty borders, or stretched [crop]",
     )  # fmt: skip
     parser.add_argument("--masks", action="store_true", help="find the vehicle's own body (reads the whole recording)")
+    parser.add_argument(
+        "--refine", action="store_true", help="turn cameras until neighbours' pictures agree (runs the network)"
+    )
+    parser.add_argument(
+        "--checkpoint", default="", metavar="FILE", help="with --refine: the network's weights [the package's own]"
+    )
     parser.add_argument("--force", action="store_true", help="overwrite the rig file and its masks")
     add_json(parser)
 
@@ -85,7 +97,10 @@ def execute(arguments: argparse.Namespace) -> None:
             if not arguments.force:
                 refuse_to_overwrite(*(folder / f"{name}.png" for name in layout.names))
             layout, shares = _with_found_masks(recorded.with_layout(layout), folder)
-    result = _describe(layout, layout.complete(), shares)
+        mounts: dict[str, Any] = {}
+        if arguments.refine:
+            layout, mounts = _with_refined_mounts(recorded.with_layout(layout), arguments.checkpoint)
+    result = {**_describe(layout, layout.complete(), shares), **mounts}
     source = f"cvcdepth rig {package_version()}, from the recording {path.name}"
     save_rig_layout(arguments.output, layout, f"Written by {source}.\n{_overlaps_text(result)}")
     result = {"file": str(arguments.output), "recording": arguments.recording, **result}
@@ -134,6 +149,29 @@ def _view_degrees(entry: "CameraEntry", text: str) -> float:
     if not _NARROWEST_DEG <= degrees <= lens + 1:
         raise ConfigError(f"view {text}: camera {entry.name} has a lens of {lens:.1f} degrees")
     return degrees
+
+
+def _with_refined_mounts(recorded: "RecordedRig", checkpoint: str) -> tuple["RigLayout", dict[str, Any]]:
+    """Return the layout with turned cameras, and what tells of it; RigError where the pictures carry no turn."""
+    from cvcdepth_ros.recordings.compared_pictures import compare_pictures, mounts_to_json, parts_of, turned_layout
+    from cvcdepth_ros.settings import MatchingSettings, ModelSettings
+
+    prepare_long_work()
+    recording, settings = recorded.recording, ModelSettings.model_validate({"checkpoint": checkpoint})
+    parts = parts_of(recording.start, recording.end + 1, _PARTS, _PART_SECONDS)
+    with progress_bar(1.0, "of the search", is_kept=False) as show:
+        compared = compare_pictures(recorded, settings.build_estimator(), parts, MatchingSettings(), show)
+    told = mounts_to_json(compared.rig, compared.mounts)
+    used = [pair for pair in told["pairs"] if pair["problem"] is None]
+    if not used:
+        first = told["pairs"][0]["problem"] if told["pairs"] else "no two cameras overlap"
+        raise RigError(f"{recording.path}: --refine: no pair of neighbours tells how its cameras are turned: {first}")
+    for name, turn in told["turns"].items():
+        if turn is None:
+            warn(
+                f"{recording.path}: camera {name}: no pair of neighbours leads to {compared.rig.anchor}; left as it is"
+            )
+    return turned_layout(recorded.layout, compared.mounts), {"refined": told}
 
 
 def _anchor(layout: "RigLayout", wanted: str | None) -> str:
@@ -202,9 +240,10 @@ def _text(result: dict[str, Any]) -> str:
         )
         for camera in result["cameras"]
     ]
+    refined = f"{_refined_text(result['refined'])}\n\n" if "refined" in result else ""
     header = ("camera", "yaw (deg)", "view (deg)", "size", "distortion", "mask", "images")
     return (
-        f"{table(header, cameras, apart=len(header) - 1)}\n\n{_overlaps_text(result)}\n\n"
+        f"{table(header, cameras, apart=len(header) - 1)}\n\n{_overlaps_text(result)}\n\n{refined}"
         f"base frame {result['base_frame']}, anchor camera {result['anchor']}; written to {result['file']}"
     )
 
@@ -212,6 +251,31 @@ def _text(result: dict[str, Any]) -> str:
 def _view_text(camera: dict[str, Any]) -> str:
     view, lens = camera["horizontal_view_degrees"], camera["lens_degrees"]
     return f"{view:.1f}" if abs(lens - view) < 1 else f"{view:.1f} of {lens:.1f}"
+
+
+def _refined_text(refined: dict[str, Any]) -> str:
+    """Show how well neighbours' pictures agree, and how each camera was turned."""
+    pairs = [
+        (
+            f"{p['camera']} - {p['neighbour']}",
+            str(p["patches"]),
+            _number(p["before"]),
+            _number(p["after"]),
+            p["problem"],
+        )
+        for p in refined["pairs"]
+    ]
+    header = ("pair", "patches", "correlation", "turned", "")
+    shown = table(header, [(*pair[:-1], pair[-1] or "") for pair in pairs], numbers=range(1, 4), apart=4)
+    turns = [
+        f"  {name}: {'left as it is' if turn is None else ' '.join(f'{angle:+.2f}' for angle in turn)}"
+        for name, turn in refined["turns"].items()
+    ]
+    return "\n".join([shown, "", "Turned about its own x (right), y (down) and z (ahead), in degrees:", *turns])
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
 
 
 def _mask_text(camera: dict[str, Any]) -> str:

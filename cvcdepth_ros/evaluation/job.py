@@ -48,6 +48,8 @@ class EvaluationSettings(MatchingSettings, ModelSettings):
     """Seconds that a LiDAR sweep may be from the image that it is the truth of."""
     no_occlusion_filter: bool = False
     """Take every LiDAR point for truth, also those that the camera cannot see behind a nearer surface."""
+    confidence: bool = False
+    """Score how sure depth is also where it is not refined; refined depth always has its confidence."""
     threads: int = Field(1, ge=1, le=1024)
     """CPU threads of each worker's network. Results are repeatable to the last bit for the same number."""
 
@@ -70,6 +72,16 @@ class EvaluationSettings(MatchingSettings, ModelSettings):
         from cvcdepth_core.scoring.sparse_depth import OcclusionFilter
 
         return None if self.no_occlusion_filter else OcclusionFilter()
+
+    @property
+    def replayed(self) -> ModelSettings:
+        """What is made of the predictor's depth; a reference looks at no picture, and its depth is left as it is."""
+        return self.model_copy(update={"refine": "off"}) if self.predictor else self
+
+    @property
+    def has_confidence(self) -> bool:
+        """Whether confidence is computed and scored."""
+        return self.confidence or self.replayed.refine != "off"
 
     @property
     def checkpoint_path(self) -> Path | None:

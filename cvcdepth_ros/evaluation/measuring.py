@@ -19,6 +19,7 @@ from cvcdepth_core.errors import RecordingError
 from cvcdepth_core.estimator import DepthPredictor
 from cvcdepth_core.rendering.agreement import PosedDepth
 from cvcdepth_core.rig.poses import Pose
+from cvcdepth_core.scoring.confidence_scores import ConfidenceScorer, ConfidenceScores
 from cvcdepth_core.scoring.consistency import AgreementTable, spatial_rows, temporal_rows
 from cvcdepth_core.scoring.ground_truth import overlap_pixels, sample_prediction
 from cvcdepth_core.scoring.scorer import DepthSamples, SurroundScorer
@@ -39,6 +40,8 @@ from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet
 Progress = Callable[[float], None]
 """Called with the share of the recording that is done."""
 
+_CONFIDENCE = "confidence_"  # before the names of its arrays
+_REFINED_BY_NS = 4 * NANOSECONDS  # of earlier sets, those that depth is refined with and one more second
 _LONGEST_STEP_NS = NANOSECONDS  # between two sets that are compared along the vehicle's way
 
 
@@ -95,6 +98,8 @@ class RecordingScores:
     """[S] when each set was recorded, ns."""
     references: Mapping[str, ReferenceScores]
     """What looks at no picture, by `REFERENCES`; flat ground is missing where the ground is not below every camera."""
+    confidence: ConfidenceScores | None = None
+    """None where it was not computed."""
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Return everything as arrays that numpy stores without pickling."""
@@ -110,6 +115,8 @@ class RecordingScores:
         }
         text = np.frombuffer(json.dumps(described).encode(), dtype=np.uint8)
         arrays = {f"agreement_{name}": found.agreement.columns for name, found in self.references.items()}
+        if self.confidence is not None:
+            arrays |= {f"{_CONFIDENCE}{name}": found for name, found in self.confidence.to_arrays().items()}
         return {"described": text, "agreement": self.agreement.columns, "log_times": self.log_times, **arrays}
 
     @classmethod
@@ -130,7 +137,13 @@ class RecordingScores:
             AgreementTable(map(tuple, described["pairs"]), arrays["agreement"]),
             arrays["log_times"],
             references,
+            _confidence_from(arrays),
         )
+
+
+def _confidence_from(arrays: Mapping[str, NDArray[Any]]) -> ConfidenceScores | None:
+    found = {name.removeprefix(_CONFIDENCE): array for name, array in arrays.items() if name.startswith(_CONFIDENCE)}
+    return ConfidenceScores.from_arrays(found) if found else None
 
 
 class RecordingEvaluation:
@@ -141,7 +154,12 @@ class RecordingEvaluation:
         self.job = job
         self.replay = SurroundReplay(recorded, job.settings)
         self.truth = RecordedTruth(recorded, job.lidar, job.settings.lidar_tolerance)
-        self.depths = DepthReplay(self.replay, predictor or job.settings.build_predictor(self.replay.rig))
+        self.depths = DepthReplay(
+            self.replay,
+            predictor or job.settings.build_predictor(self.replay.rig),
+            settings=job.settings.replayed,
+            wants_confidence=job.settings.has_confidence,
+        )
 
     @property
     def window(self) -> tuple[int, int]:
@@ -184,7 +202,8 @@ class RecordingEvaluation:
         It is matched anew from shortly before it, by the rig and the network of this evaluation.
         """
         anew = RecordingEvaluation(self.job, self.replay.recorded, self.depths.estimator)
-        for measured in anew.sets(log_time - 2 * NANOSECONDS, log_time + NANOSECONDS, stamp_ns):
+        before = _REFINED_BY_NS if self.depths.refinement.is_active else 2 * NANOSECONDS
+        for measured in anew.sets(log_time - before, log_time + NANOSECONDS, stamp_ns):
             return measured
         raise RecordingError(f"{self.job.path}: no set at {stamp_ns} ns")
 
@@ -259,6 +278,7 @@ class _Scoring:
         self.references = references
         self._latencies = latencies
         self._scorer = SurroundScorer(job.name, cameras, job.settings.scores)
+        self._confidence = ConfidenceScorer(cameras, job.settings.min_depth, job.settings.max_depth)
         self._agreement = AgreementTable()
         self._earlier: tuple[int, PosedDepth] | None = None
         self._log_times = array("q")
@@ -271,6 +291,7 @@ class _Scoring:
             samples = measured.samples()
             points = self._scorer.add(measured.stamp_ns, samples)
             self.references.add(measured.stamp_ns, samples, measured.truth)
+            self._confidence.add(measured.estimated.result, measured.truth)
         self.truth_points += points
         self.sets_with_truth += points > 0
         with self._latencies.measure("label-free"), torch.inference_mode():
@@ -286,7 +307,8 @@ class _Scoring:
         """Return what was found."""
         log_times = np.array(self._log_times, dtype=np.int64)
         scores, references = self._scorer.scores(), self.references.result()
-        return RecordingScores(self._job.name, summary, scores, self._agreement, log_times, references)
+        confidence = self._confidence.scores()
+        return RecordingScores(self._job.name, summary, scores, self._agreement, log_times, references, confidence)
 
     def _compare(self, measured: MeasuredSet) -> None:
         stamp, rig, posed = measured.stamp_ns, measured.estimated.rig, measured.posed
@@ -315,6 +337,7 @@ def _summary(evaluation: RecordingEvaluation, scoring: _Scoring) -> dict[str, An
         "clouds_of_cameras": list(truth.left_out),
         "why_no_lidar": describe_left_out_clouds(truth.left_out) if truth.left_out else "",
         "motion": truth.motion.topic if truth.motion else None,
+        "refinement": depths.refinement.summary(),
         "sets": {
             "scored": scoring.sets,
             "with_truth": scoring.sets_with_truth,

@@ -15,6 +15,7 @@ from cvcdepth_core.errors import ConfigError, RecordingError
 from cvcdepth_core.files import nan_to_null
 from cvcdepth_core.networks.checkpoint import load_checkpoint
 from cvcdepth_core.scoring.comparison import Comparison, compare
+from cvcdepth_core.scoring.confidence_scores import ConfidenceScores
 from cvcdepth_core.scoring.consistency import AgreementTable, summarise_agreement
 from cvcdepth_core.scoring.scores import ALL, SCALINGS, EvaluationProtocol, Scaling, Score, Scores, Summary
 from cvcdepth_ros.evaluation.image_scores import (
@@ -146,6 +147,12 @@ class EvaluationResult:
         by_scaling = {scaling: scores.summary("image", scaling).mean[ALL] for scaling in SCALINGS}
         return Reference(by_scaling, mean_label_free(label_free.values()))
 
+    @cached_property
+    def confidence(self) -> ConfidenceScores | None:
+        """How good confidence is; None where it was not computed."""
+        found = [recording.confidence for recording in self.recordings if recording.confidence is not None]
+        return ConfidenceScores.merged(found) if found else None
+
     @property
     def truth_points(self) -> int:
         """How many pixels have truth inside the depth limits."""
@@ -163,6 +170,7 @@ class EvaluationResult:
             "scores": {p: {s: self.summary(p, s).to_json() for s in SCALINGS} for p in PROTOCOLS},
             "scale_ratio": {p: nan_to_null(self.scores.scale_ratios(p)) for p in PROTOCOLS},
             "label_free": self._label_free(),
+            "confidence": self.confidence.to_json() if self.confidence else None,
             "references": {name: reference.to_json() for name, reference in self.references.items()},
             "recordings": [recording.summary for recording in self.recordings],
             "trained_on": [seen._asdict() for seen in self.trained_on],

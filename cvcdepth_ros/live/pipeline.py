@@ -29,6 +29,7 @@ from cvcdepth_ros.live.picture_preparation import CameraImage, PicturePreparer
 from cvcdepth_ros.live.video_streams import VideoImage, VideoStreams
 from cvcdepth_ros.messages.conversion import is_video_packet, stamp_ns
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
+from cvcdepth_ros.surround_sets.refinement import RefinementStage
 from cvcdepth_ros.surround_sets.set_estimation import EncodedImage, EstimatedSet, usable_pictures
 from cvcdepth_ros.surround_sets.synchronizer import SurroundSet, SurroundSynchronizer
 
@@ -58,6 +59,7 @@ class SurroundPipeline:
         publish: Callable[[EstimatedSet[CameraImage]], None],
         observe: Callable[[EstimatedSet[CameraImage]], None],
         latencies: StageLatencies,
+        refinement: RefinementStage,
     ) -> None:
         """Start the threads.
 
@@ -72,6 +74,7 @@ class SurroundPipeline:
         self._publish = publish
         self._observe = observe
         self._latencies = latencies
+        self._refinement = refinement
         self._rig: Rig | None = None
         self._build: Future[_Build] | None = None
         self._builds: list[Future[_Build]] = []
@@ -249,17 +252,19 @@ class SurroundPipeline:
         self._latencies.record("wait for set", max(received) - min(received))
         self._latencies.record("wait for inference", time.monotonic() - max(received))
         pictures = self._pictures(needed, rectifiers, len(images))
-        with self._latencies.measure("inference"), self._pace.measured():
-            result = surround.estimate([pictures.get(name) for name in rectifiers])
-        self._estimates.put(EstimatedSet(surround_set, surround.rig, result))
+        with self._pace.measured():
+            with self._latencies.measure("inference"):
+                result = surround.estimate([pictures.get(name) for name in rectifiers])
+            estimated = self._refinement.finished(surround, surround_set, result)
+        self._estimates.put(estimated)
 
     def _needed(self, cameras: Iterable[str], surround: SurroundDepthEstimator) -> list[str]:
         """Return which of the cameras' pictures the network needs for the depth that is wanted.
 
-        One that looks at all cameras together must see them all for any: whoever subscribes to one camera gets what
-        whoever subscribes to all gets.
+        One that looks at all cameras together must see them all for any, and so must refinement: whoever subscribes to
+        one camera gets what whoever subscribes to all gets.
         """
-        if surround.estimator.independent:
+        if surround.estimator.independent and not self._refinement.is_active:
             return [name for name in cameras if self._wanted(name)]
         return list(cameras) if any(map(self._wanted, self._watches)) else []
 
