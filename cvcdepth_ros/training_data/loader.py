@@ -18,7 +18,7 @@ from cvcdepth_core.training.batch import RigBatch
 from cvcdepth_core.training.config import RecordingsConfig, TrainingConfig
 from cvcdepth_core.training.distributed import SINGLE_PROCESS, Processes
 from cvcdepth_ros.training_data.index import RecordingIndex
-from cvcdepth_ros.training_data.sample_choice import Sample, find_samples, refuse_standstill
+from cvcdepth_ros.training_data.sample_choice import Sample, find_samples, refuse_standstill, takes_recorded_motion
 from cvcdepth_ros.training_data.samples import NetworkRig, ReadSample, SampleReader
 
 
@@ -54,7 +54,7 @@ class RecordingBatches:
             for sample in find_samples(index, config.recordings, "training", recording)
         ]
         self.reader = SampleReader(indexes, samples, config.depth.height, config.depth.width, config.recordings)
-        self._rig_groups = _group_by_rig(indexes, samples)
+        self._rig_groups = _group_by_rig(indexes, samples, config.recordings)
         self._processes = processes
         self._samples_together = config.optimizer.samples_per_batch * processes.count
         self._seed = config.seed
@@ -86,11 +86,12 @@ class RecordingBatches:
 
 def _refuse_unrecorded_motion(indexes: Sequence[RecordingIndex], config: RecordingsConfig) -> None:
     without = [str(index.path) for index in indexes if index.poses is None]
-    if config.exposure_motion == "recorded" and without:
-        raise RecordingError(
-            f"{', '.join(without)}: no motion is recorded, but recordings.exposure_motion is 'recorded'; 'auto' takes "
-            "the pose network's there"
-        )
+    for name in ("motion", "exposure_motion"):
+        if getattr(config, name) == "recorded" and without:
+            raise RecordingError(
+                f"{', '.join(without)}: no motion is recorded, but recordings.{name} is 'recorded'; 'auto' takes "
+                "the pose network's there"
+            )
 
 
 def _at_least(samples: list[int], count: int) -> list[int]:
@@ -98,12 +99,14 @@ def _at_least(samples: list[int], count: int) -> list[int]:
     return list(islice(cycle(samples), max(count, len(samples))))
 
 
-def _group_by_rig(indexes: Sequence[RecordingIndex], samples: Sequence[Sample]) -> list[list[int]]:
-    """Return the samples' positions, those of equal rigs together."""
-    layouts = [index.layout for index in indexes]
+def _group_by_rig(
+    indexes: Sequence[RecordingIndex], samples: Sequence[Sample], config: RecordingsConfig
+) -> list[list[int]]:
+    """Return the samples' positions, those of equal rigs and of motion from the same source together."""
+    kinds = [(index.layout, takes_recorded_motion(index, config)) for index in indexes]
     groups: dict[int, list[int]] = {}
     for position, sample in enumerate(samples):
-        groups.setdefault(layouts.index(layouts[sample.recording]), []).append(position)
+        groups.setdefault(kinds.index(kinds[sample.recording]), []).append(position)
     return list(groups.values())
 
 
@@ -132,4 +135,5 @@ def _collate(rigs: Sequence[NetworkRig], items: Sequence[ReadSample | None]) -> 
         return None
     recordings, *columns = zip(*read, strict=True)
     rig: NetworkRig = rigs[recordings[0]]
-    return rig.batch(*(torch.from_numpy(np.stack(column)) for column in columns))
+    known = [column for column in columns if column[0] is not None]  # recorded poses, the last, may be unknown to all
+    return rig.batch(*(torch.from_numpy(np.stack(column)) for column in known))
