@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from cvcdepth_core.errors import ConfigError, first_validation_message
-from cvcdepth_core.model_choices import DEFAULT, NOTICE, Backend, Precision, checkpoint_path
+from cvcdepth_core.model_choices import DEFAULT, NOTICE, Backend, FlipFusion, Precision, checkpoint_path
 
 if TYPE_CHECKING:
     from cvcdepth_core.estimator import DepthEstimator
@@ -62,11 +62,18 @@ class ModelSettings(Settings):
     """In what a CUDA device computes; CPUs know float32 only."""
     cpu_fallback: bool = False
     """Go on with the CPU, more slowly, when the GPU fails, or its memory is too small even for one camera."""
+    flip_fusion: bool = False
+    """Run the network on mirrored pictures too and fuse both depths, as the paper's best rows do: twice the cost."""
 
     @property
     def checkpoint_path(self) -> Path | None:
         """The checkpoint's file; None for a network with random weights."""
         return None if self.untrained else checkpoint_path(self.checkpoint)
+
+    @property
+    def fusion(self) -> FlipFusion:
+        """What is fused."""
+        return "depth" if self.flip_fusion else "none"
 
     @property
     def notice(self) -> str:
@@ -79,7 +86,7 @@ class ModelSettings(Settings):
         """Return the checkpoint's network, or an untrained one; CheckpointError or ConfigError says what is wrong."""
         from cvcdepth_core.estimator import DepthEstimator
 
-        engine = self.model_dump(include={"backend", "precision", "cpu_fallback"})
+        engine = self.model_dump(include={"backend", "precision", "cpu_fallback"}) | {"flip_fusion": self.fusion}
         path = self._checked_path()
         if path is not None:
             return DepthEstimator.from_checkpoint(path, self.device, **engine)

@@ -60,6 +60,9 @@ class RecordingsConfig(_Section):
     min_image_change: float = Field(default=2.0, ge=0, allow_inf_nan=False)
     """Instead of `min_travel` where no motion is recorded: mean absolute difference of the anchor camera's small grey
     pictures, of 255."""
+    further_travels: tuple[float, ...] = ()
+    """Where `motion` is recorded: further least distances, in metres; every epoch draws for each target whether it is
+    `min_travel` or one of these. Longer ways show depth that is far away, and the pose network other speeds."""
     max_interval: float = Field(default=0.5, gt=0, allow_inf_nan=False)
     """Seconds from a target to a context frame, at most: a longer gap of the recording is not bridged. Where motion is
     recorded, one and a half times the recording's own time from set to set is allowed too."""

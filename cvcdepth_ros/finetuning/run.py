@@ -113,7 +113,7 @@ def fine_tune(job: FinetuneJob, processes: Processes, warn: Callable[[str], None
     weights, after, verdict = _judged(job, parts, before)
     if after is not None:
         _warn_of_pose_network(after, "the trained", prepared, warn)
-    samples = [sum(sample.recording == i for sample in batches.reader.samples) for i in range(len(prepared.indexes))]
+    samples = [sum(sample.recording == i for sample in batches.targets) for i in range(len(prepared.indexes))]
     return FinetuneResult(job, prepared, trainer, samples, parts, weights, before, after, verdict)
 
 

@@ -18,8 +18,17 @@ from cvcdepth_core.training.batch import RigBatch
 from cvcdepth_core.training.config import RecordingsConfig, TrainingConfig
 from cvcdepth_core.training.distributed import SINGLE_PROCESS, Processes
 from cvcdepth_ros.training_data.index import RecordingIndex
-from cvcdepth_ros.training_data.sample_choice import Sample, find_samples, refuse_standstill, takes_recorded_motion
+from cvcdepth_ros.training_data.sample_choice import (
+    Sample,
+    find_samples,
+    refuse_standstill,
+    sample_variants,
+    takes_recorded_motion,
+)
 from cvcdepth_ros.training_data.samples import NetworkRig, ReadSample, SampleReader
+
+_OF_VARIANTS = 1
+"""Tells the draws of variants from those of the order."""
 
 
 class _EpochOrder:
@@ -48,13 +57,18 @@ class RecordingBatches:
         """Find the samples; RecordingError names recording and values when there are none."""
         _refuse_unrecorded_motion(indexes, config.recordings)
         refuse_standstill(indexes, config.recordings)
-        samples = [
-            sample
+        variants = [
+            sample_variants(index, config.recordings, sample)
             for recording, index in enumerate(indexes)
             for sample in find_samples(index, config.recordings, "training", recording)
         ]
-        self.reader = SampleReader(indexes, samples, config.depth.height, config.depth.width, config.recordings)
-        self._rig_groups = _group_by_rig(indexes, samples, config.recordings)
+        every = [sample for of_target in variants for sample in of_target]
+        self.reader = SampleReader(indexes, every, config.depth.height, config.depth.width, config.recordings)
+        self.targets = [of_target[0] for of_target in variants]
+        """The samples of an epoch, each with its nearest contexts."""
+        ends = np.cumsum([len(of_target) for of_target in variants])
+        self._variants = [range(end - len(of_target), end) for of_target, end in zip(variants, ends, strict=True)]
+        self._rig_groups = _group_by_rig(indexes, self.targets, config.recordings)
         self._processes = processes
         self._samples_together = config.optimizer.samples_per_batch * processes.count
         self._seed = config.seed
@@ -67,16 +81,25 @@ class RecordingBatches:
     @property
     def samples(self) -> int:
         """Samples of one epoch, of all processes together."""
-        return len(self.reader)
+        return len(self.targets)
 
     def epoch(self, number: int, first: int = 0) -> Iterator[RigBatch | None]:
         """Yield the batches of an epoch from the `first` on; None for one whose images are all damaged."""
         rank, count = self._processes.rank, self._processes.count
-        self._order.batches = [_at_least(together, count)[rank::count] for together in self._shuffled(number)[first:]]
+        drawn = self._drawn(number)
+        self._order.batches = [
+            [drawn[target] for target in _at_least(together, count)[rank::count]]
+            for together in self._shuffled(number)[first:]
+        ]
         yield from self._loader
 
+    def _drawn(self, epoch: int) -> list[int]:
+        """Return the place in the reader of the variant of each target that an epoch takes."""
+        generator = np.random.default_rng([self._seed, epoch, _OF_VARIANTS])
+        return [places[int(generator.integers(len(places)))] for places in self._variants]
+
     def _shuffled(self, epoch: int) -> list[list[int]]:
-        """Return the samples that go together through the networks of all processes."""
+        """Return the targets that go together through the networks of all processes."""
         generator = np.random.default_rng([self._seed, epoch])
         size = self._samples_together
         orders = [generator.permutation(group).tolist() for group in self._rig_groups]

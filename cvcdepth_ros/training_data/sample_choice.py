@@ -59,15 +59,34 @@ def first_held_out(index: RecordingIndex, held_out: float) -> int:
     return len(index) - math.ceil(held_out * (len(index) - 1))
 
 
-def find_samples(index: RecordingIndex, config: RecordingsConfig, part: Part, recording: int = 0) -> list[Sample]:
-    """Return the samples of one part of a recording, none of whose sets is of the other part.
+def find_samples(
+    index: RecordingIndex,
+    config: RecordingsConfig,
+    part: Part,
+    recording: int = 0,
+    targets: Sequence[int] | None = None,
+) -> list[Sample]:
+    """Return the samples of one part of a recording, or of some targets of it; none of their sets is of the other part.
 
     A sample's contexts are the nearest sets before and after the target that the vehicle has moved far enough from.
     Where they are known to be farther than wanted, or than the pose network can express, there is no sample, see
     `describe_skipped_samples`.
     """
-    found = _within_interval(index, config, part, recording)
+    found = _within_interval(index, config, part, recording, targets)
     return [sample for sample in found if _travel(index, sample) <= _greatest_travel(index, config)]
+
+
+def sample_variants(index: RecordingIndex, config: RecordingsConfig, sample: Sample) -> list[Sample]:
+    """Return a training sample and, for recorded motion, the same target with contexts that are farther away.
+
+    Where sets are far apart or the end is near, there are fewer than `further_travels` has.
+    """
+    variants = [sample]
+    if takes_recorded_motion(index, config):
+        for least in config.further_travels:
+            further = config.model_copy(update={"min_travel": max(least, config.min_travel)})
+            variants += find_samples(index, further, "training", sample.recording, [sample.target])
+    return list(dict.fromkeys(variants))
 
 
 def describe_skipped_samples(index: RecordingIndex, config: RecordingsConfig) -> str | None:
@@ -96,11 +115,17 @@ def _travel(index: RecordingIndex, sample: Sample) -> float:
     return max(change_between(index, sample.target, other) for other in (sample.before, sample.after))
 
 
-def _within_interval(index: RecordingIndex, config: RecordingsConfig, part: Part, recording: int = 0) -> list[Sample]:
+def _within_interval(
+    index: RecordingIndex,
+    config: RecordingsConfig,
+    part: Part,
+    recording: int = 0,
+    targets: Sequence[int] | None = None,
+) -> list[Sample]:
     held_out = np.arange(len(index)) >= first_held_out(index, config.held_out)
-    members = np.flatnonzero(held_out == (part == "held_out"))
+    members = np.flatnonzero(held_out == (part == "held_out")).tolist()
     samples = []
-    for target in members.tolist():
+    for target in members if targets is None else targets:
         before = _context(index, config, target, -1)
         after = _context(index, config, target, +1)
         if before is not None and after is not None and held_out[before] == held_out[after] == held_out[target]:
