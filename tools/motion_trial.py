@@ -23,7 +23,6 @@ from typing import Any, NamedTuple
 import yaml
 
 from cvcdepth_core.training.run_folder import CHECKPOINT_FILE
-from cvcdepth_ros.bags import open_recording
 
 PROMOTED, NOT_PROMOTED = 0, 3
 FAR = ("20-40", "40-80")
@@ -80,6 +79,7 @@ def train(options: argparse.Namespace, arm: Arm, seed: int, folder: Path) -> Non
         "base": str(options.config.resolve()),
         "recordings": {"motion": arm.motion},
         "optimizer": {"epochs": options.epochs, "decay_after_epochs": options.epochs, "autocast": "auto"},
+        "evaluation": {"sets": 2},  # all are scored at the end, and nothing is chosen by them
         "validate_every": options.epochs,
         "seed": seed,
     }
@@ -94,9 +94,7 @@ def scored(options: argparse.Namespace, checkpoint: str, folder: Path) -> Row:
     """Score a checkpoint on the held-out quarter, as a user would; what is there is not done again."""
     metrics = folder / "metrics.json"
     if not metrics.exists():
-        with open_recording(options.recording) as recording:
-            seconds = (recording.end - recording.start) * 1e-9
-        window = ["--start", f"{options.held_out_from * seconds:.3f}", "--max-depth", "80", "--no-report"]
+        window = ["--start", f"{options.start:g}", "--min-depth", "0.5", "--no-report"]
         command("evaluate", options.recording, options.rig, "--checkpoint", checkpoint, *window, "-o", str(folder))
     return row(json.loads(metrics.read_text(encoding="utf-8")))
 
@@ -148,7 +146,7 @@ def parse_options() -> argparse.Namespace:
     parser.add_argument("--config", type=Path, default=shipped, help="what all runs have in common [finetune.yaml]")
     parser.add_argument("--epochs", type=int, default=8, help="of each run [8]")
     parser.add_argument("--seeds", type=int, default=3, help="runs of each way [3]")
-    parser.add_argument("--held-out-from", type=float, default=0.75, metavar="SHARE", help="of the recording [0.75]")
+    parser.add_argument("--start", type=float, default=2.93, help="second at which the held-out sets begin [2.93]")
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the runs")
     return parser.parse_args()
 
