@@ -546,7 +546,7 @@ def test_a_pose_network_that_odometry_contradicts_is_a_warning(check, sample, tm
 
     found = check(recordings.changed(sample, "/tf", stretch), "--checkpoint", "default")["pose network"]
     assert found["status"] == "warning"
-    assert "of the recorded way in 8 steps" in found["finding"]
+    assert "of the recorded way in 6 steps" in found["finding"]
     assert "finetune" in found["remedy"]
 
 
