@@ -315,7 +315,9 @@ class Trainer:
         if not values:
             return 0, 0.0, {}
         columns = {"": [value.per_sample for value in values]}
-        columns |= {name: [value.terms[name].flatten() for value in values] for name in values[0].terms}
+        for value in values:  # a term may be there for some recordings only
+            for name, term in value.terms.items():
+                columns.setdefault(name, []).append(term.flatten())
         joined = [torch.cat(column).double() for column in columns.values()]
         sums = torch.stack([torch.stack([column.sum(), torch.ones_like(column).sum()]) for column in joined])
         totals, counts = self._processes.sum_over_processes(sums).unbind(1)

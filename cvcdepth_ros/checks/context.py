@@ -7,6 +7,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from cvcdepth_core.images.decoding import Picture
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.rig.rig_file import RigLayout
 from cvcdepth_core.stamps import exposure_times
+from cvcdepth_core.training.config import RecordingsConfig
 from cvcdepth_ros.bags import RecordedMessage, Recording
 from cvcdepth_ros.messages.camera_discovery import RECORDED_IMAGE_TYPES
 from cvcdepth_ros.messages.conversion import picture_from_message
@@ -33,6 +35,7 @@ from cvcdepth_ros.surround_sets.synchronizer import SurroundSet, SurroundSynchro
 Status = Literal["passed", "warning", "failed", "skipped"]
 
 _DEFAULTS = MatchingSettings()
+_TRAINING = RecordingsConfig()
 _KEPT_SWEEPS = 3
 _SHOWN_SETS = 3
 
@@ -63,6 +66,10 @@ class CheckOptions:
     """The vehicle's frame where no rig file names it."""
     lidar: tuple[str, ...] | None = None
     """LiDAR topics; None for all of the recording, see `RigMessages.lidars`."""
+    training: RecordingsConfig = _TRAINING
+    """How training samples would be chosen."""
+    checkpoint: Path | None = None
+    """Weights whose pose network is compared with the recorded motion."""
     start: int | None = None
     """First log time to read, ns."""
     stop: int | None = None

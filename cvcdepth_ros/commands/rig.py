@@ -113,7 +113,7 @@ def _with_found_masks(recorded: "RecordedRig", folder: Path) -> tuple["RigLayout
     from cvcdepth_ros.training_data.index import index_recording
     from cvcdepth_ros.training_data.own_body_masks import find_self_occlusion, save_masks
 
-    found = find_self_occlusion(index_recording(recorded.completed(), MatchingSettings(), needs_overlaps=False))
+    found = find_self_occlusion(index_recording(recorded.completed(), MatchingSettings(), scale_from="nothing"))
     for doubt in found.doubts(folder):
         warn(f"{recorded.recording.path}: {doubt}")
     shares = {name: round(body.share, 4) for name, body in found.by_camera.items()}

@@ -29,6 +29,7 @@ from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_core.visualization import Points
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.evaluation.job import EvaluationJob
+from cvcdepth_ros.evaluation.pose_scores import PoseScoring
 from cvcdepth_ros.evaluation.references import ReferenceScores, ReferenceScoring
 from cvcdepth_ros.messages.cloud_sources import describe_left_out_clouds
 from cvcdepth_ros.recordings.replay import DepthReplay, RecordedImage, SurroundReplay
@@ -281,6 +282,7 @@ class _Scoring:
         self._confidence = ConfidenceScorer(cameras, job.settings.min_depth, job.settings.max_depth)
         self._agreement = AgreementTable()
         self._earlier: tuple[int, PosedDepth] | None = None
+        self.poses = PoseScoring(job.settings.checkpoint_path)
         self._log_times = array("q")
         self.sets_with_truth = 0
         self.truth_points = 0
@@ -296,6 +298,8 @@ class _Scoring:
         self.sets_with_truth += points > 0
         with self._latencies.measure("label-free"), torch.inference_mode():
             self._compare(measured)
+        with self._latencies.measure("pose network"):
+            self.poses.add(measured)
         self._log_times.append(measured.log_time)
 
     @property
@@ -346,6 +350,8 @@ def _summary(evaluation: RecordingEvaluation, scoring: _Scoring) -> dict[str, An
             "refused": depths.refused.count,
         },
         "truth_points": scoring.truth_points,
+        "pose_network": scoring.poses.result(),
+        "why_no_pose_network": scoring.poses.problem or None,
         "no_flat_ground": scoring.references.problem or None,
         "refused": depths.refused.reasons + replay.unreadable.reasons,
         "truth_refused": {"count": truth.refused.count, "reasons": truth.refused.reasons[:10]},
