@@ -140,7 +140,7 @@ class SurroundDepthEstimator:
         self.preprocessor: SurroundPreprocessor = SurroundPreprocessor(
             rig, estimator.spec.height, estimator.spec.width, known.preprocessor if known else None
         )
-        self._base_T_camera = np.stack([camera.base_T_camera for camera in rig.cameras])
+        self._base_T_camera = rig.poses_above_ground
 
     def warm_up(self) -> None:
         """Estimate black pictures, so that what an engine does but once for so many cameras is done."""
