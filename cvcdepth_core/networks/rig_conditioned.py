@@ -45,7 +45,7 @@ class RigConditionedNet(ConditionedNetwork):
     ENCODER: ClassVar[str] = "efficientnet_lite0"
 
     def __init__(self, min_depth: float, max_depth: float, focal_scale: float) -> None:
-        """The three are those of the checkpoint, see `DepthModelSpec`."""
+        """Take the fields of `DepthModelSpec` of these names."""
         super().__init__()
         self._nearest, self._farthest, self._focal_scale = 1 / min_depth, 1 / max_depth, focal_scale
         self.depth_encoder = EfficientNetLite0Encoder(3)
