@@ -32,6 +32,7 @@ from cvcdepth_ros.evaluation.references import ReferenceScores, ReferenceScoring
 from cvcdepth_ros.messages.cloud_sources import describe_left_out_clouds
 from cvcdepth_ros.recordings.replay import DepthReplay, RecordedImage, SurroundReplay
 from cvcdepth_ros.recordings.rig import RecordedRig
+from cvcdepth_ros.recordings.true_depth import RecordedDepthImages
 from cvcdepth_ros.recordings.truth import RecordedTruth
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
 from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet
@@ -77,8 +78,19 @@ class MeasuredSet:
         for name, truth, prediction in zip(rig.names, self.truth, depth, strict=True):
             others = [views[other] for other in rig.neighbours[name]]
             overlap = overlap_pixels(truth, views[name], others)
-            found.append(DepthSamples(sample_prediction(prediction, truth), truth.depth, overlap))
+            found.append(DepthSamples(sample_prediction(prediction, truth), truth.depth, overlap, truth.parts))
         return found
+
+    def sky(self, far: float) -> tuple[int, int]:
+        """Return the pixels with depth that show the sky, and those among them whose depth is beyond `far` metres."""
+        pixels = seen = 0
+        for truth, prediction in zip(self.truth, self.estimated.result.depth, strict=True):
+            rows, columns = truth.sky.T
+            depth = np.zeros(len(rows))
+            there = sample_prediction(prediction, SparseDepth(rows, columns, depth, truth.height, truth.width))
+            pixels += int((~np.isnan(there)).sum())
+            seen += int((there > far).sum())
+        return pixels, seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +151,7 @@ class RecordingEvaluation:
         """`predictor` is the job's where it is loaded already; without it, it is loaded here."""
         self.job = job
         self.replay = SurroundReplay(recorded, job.settings)
-        self.truth = RecordedTruth(recorded, job.lidar, job.settings.lidar_tolerance)
+        self.truth = _truth(job, recorded)
         self.depths = DepthReplay(self.replay, predictor or job.settings.build_predictor(self.replay.rig))
 
     @property
@@ -200,6 +212,12 @@ class RecordingEvaluation:
             lidar = self.truth.points(surround_set.time_ns)
             self.truth.forget_before(min(surround_set.times_ns.values()))
         return MeasuredSet(estimated, truth, poses, lidar)
+
+
+def _truth(job: EvaluationJob, recorded: RecordedRig) -> RecordedTruth | RecordedDepthImages:
+    if job.settings.truth == "depth":
+        return RecordedDepthImages(recorded)
+    return RecordedTruth(recorded, job.lidar, job.settings.lidar_tolerance)
 
 
 @contextmanager
@@ -263,6 +281,7 @@ class _Scoring:
         self._log_times = array("q")
         self.sets_with_truth = 0
         self.truth_points = 0
+        self.sky = np.zeros(2, np.int64)
 
     def add(self, measured: MeasuredSet) -> None:
         """Score one set; sets come in order."""
@@ -271,6 +290,8 @@ class _Scoring:
             points = self._scorer.add(measured.stamp_ns, samples)
             self.references.add(measured.stamp_ns, samples, measured.truth)
         self.truth_points += points
+        if self._job.settings.truth == "depth":
+            self.sky += measured.sky(self._job.settings.max_depth)
         self.sets_with_truth += points > 0
         with self._latencies.measure("label-free"), torch.inference_mode():
             self._compare(measured)
@@ -322,6 +343,7 @@ def _summary(evaluation: RecordingEvaluation, scoring: _Scoring) -> dict[str, An
             "refused": depths.refused.count,
         },
         "truth_points": scoring.truth_points,
+        "sky": {"pixels": int(scoring.sky[0]), "far": int(scoring.sky[1])},
         "no_flat_ground": scoring.references.problem or None,
         "refused": depths.refused.reasons + replay.unreadable.reasons,
         "truth_refused": {"count": truth.refused.count, "reasons": truth.refused.reasons[:10]},

@@ -130,7 +130,7 @@ def test_batch_statistics_stay_as_they_were_when_it_trains(network):
 
 
 def test_a_picture_of_a_size_that_it_cannot_take_is_refused(network):
-    with pytest.raises(ImageError, match="input is 100x64 .width x height., both must be multiples of 32"):
+    with pytest.raises(ImageError, match=r"input is 100x64 .width x height., both must be multiples of 32"):
         network(ring_of_cameras(64, 100))
 
 

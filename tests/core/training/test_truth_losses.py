@@ -123,7 +123,7 @@ def test_a_batch_with_nothing_to_learn_from_or_impossible_truth_is_refused_by_na
     with pytest.raises(ImageError, match=r"truth: shape is \[2, 3, 1, 32, 40\], expected \[2, 3, 1, 32, 48\]"):
         with_truth(whole, truth[..., :40], contexts=True)
     truth[1, 2, 0, 4, 5] = -3.0
-    with pytest.raises(ImageError, match="sample 1, camera camera2: truth of -3.0 m, expected above 0"):
+    with pytest.raises(ImageError, match=r"sample 1, camera camera2: truth of -3\.0 m, expected above 0"):
         with_truth(whole, truth, contexts=True)
     with pytest.raises(RigError, match="no neighbour"):  # as ever, where contexts are to be learned from
         RigBatch(

@@ -140,5 +140,5 @@ def test_a_folder_without_shards_and_a_damaged_shard_are_named(shards: Path, tmp
     with pytest.raises(RecordingError, match=rf"{tmp_path}: no shards \(\*.shard.zip\) there"):
         find_shards([tmp_path])
     (tmp_path / "cut.shard.zip").write_bytes(find_shards([shards])[0].read_bytes()[:500])
-    with pytest.raises(RecordingError, match="cut.shard.zip: is no shard of a simulated drive"):
+    with pytest.raises(RecordingError, match=r"cut\.shard\.zip: is no shard of a simulated drive"):
         WorldBatches(find_shards([tmp_path]), CONFIG)
