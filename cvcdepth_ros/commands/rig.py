@@ -7,7 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
-from cvcdepth_core.errors import ConfigError, RigError
+from pydantic import ValidationError
+
+from cvcdepth_core.errors import ConfigError, RigError, first_validation_message
 from cvcdepth_core.rig.view import Aspect
 from cvcdepth_ros.commands.arguments import add_json, add_recording, add_rig, refuse_to_overwrite, rig_layout
 from cvcdepth_ros.console import print_result, progress_bar, table, warn
@@ -59,6 +61,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--aspect", choices=get_args(Aspect),
         help="how pictures come into a network of another shape: cut off, with empty borders, or stretched [crop]",
     )  # fmt: skip
+    parser.add_argument(
+        "--ground-height",
+        type=float,
+        metavar="M",
+        help="how high the ground lies in the base frame, metres: below 0 where that is above it [0]",
+    )
     parser.add_argument("--masks", action="store_true", help="find the vehicle's own body (reads the whole recording)")
     parser.add_argument(
         "--refine", action="store_true", help="turn cameras until neighbours' pictures agree (runs the network)"
@@ -82,7 +90,7 @@ def execute(arguments: argparse.Namespace) -> None:
         given = rig_layout(arguments)
         recorded = RecordedRig.from_recording(recording, given, arguments.base_frame)
         recorded = recorded if given is None else recorded.completed()
-        layout = _with_views(recorded.layout, arguments.view)
+        layout = _with_ground(_with_views(recorded.layout, arguments.view), arguments.ground_height)
         layout = layout.model_copy(
             update={
                 "anchor": _anchor(layout, arguments.anchor),
@@ -174,6 +182,17 @@ def _with_refined_mounts(recorded: "RecordedRig", checkpoint: str) -> tuple["Rig
     return turned_layout(recorded.layout, compared.mounts), {"refined": told}
 
 
+def _with_ground(layout: "RigLayout", height: float | None) -> "RigLayout":
+    from cvcdepth_core.rig.rig_file import RigLayout
+
+    if height is None:
+        return layout
+    try:
+        return RigLayout.model_validate(layout.model_dump() | {"ground_height": height})
+    except ValidationError as error:
+        raise ConfigError(f"--ground-height: {first_validation_message(error)}") from error
+
+
 def _anchor(layout: "RigLayout", wanted: str | None) -> str:
     if wanted is not None and wanted not in layout.names:
         raise ConfigError(f"anchor: no camera is called {wanted}; there are {', '.join(layout.names)}")
@@ -181,9 +200,13 @@ def _anchor(layout: "RigLayout", wanted: str | None) -> str:
 
 
 def _describe(layout: "RigLayout", rig: "Rig", masked: Mapping[str, float]) -> dict[str, Any]:
+    from cvcdepth_core.rig.ground import heights_above_ground
+
+    heights = heights_above_ground(rig)
     return {
         "base_frame": rig.base_frame,
         "anchor": rig.anchor,
+        "ground_height": rig.ground_height,
         "cameras": [
             {
                 "name": camera.name,
@@ -191,6 +214,7 @@ def _describe(layout: "RigLayout", rig: "Rig", masked: Mapping[str, float]) -> d
                 "frame_id": entry.frame_id,
                 "mask": str(entry.mask) if entry.mask else None,
                 "masked_share": masked.get(camera.name),
+                "metres_above_ground": round(heights[camera.name], 3),
                 **_view(entry, camera),
             }
             for entry, camera in zip(layout.cameras, rig.cameras, strict=True)
@@ -233,6 +257,7 @@ def _text(result: dict[str, Any]) -> str:
             camera["name"],
             f"{camera['yaw_degrees']:.1f}",
             _view_text(camera),
+            f"{camera['metres_above_ground']:.2f}",
             f"{camera['width']}x{camera['height']}",
             "rectified" if camera["rectified"] else camera["distortion"],
             _mask_text(camera),
@@ -241,10 +266,11 @@ def _text(result: dict[str, Any]) -> str:
         for camera in result["cameras"]
     ]
     refined = f"{_refined_text(result['refined'])}\n\n" if "refined" in result else ""
-    header = ("camera", "yaw (deg)", "view (deg)", "size", "distortion", "mask", "images")
+    header = ("camera", "yaw (deg)", "view (deg)", "height (m)", "size", "distortion", "mask", "images")
     return (
         f"{table(header, cameras, apart=len(header) - 1)}\n\n{_overlaps_text(result)}\n\n{refined}"
-        f"base frame {result['base_frame']}, anchor camera {result['anchor']}; written to {result['file']}"
+        f"base frame {result['base_frame']}, the ground at {result['ground_height']:g} m in it (--ground-height; some "
+        f"networks need it), anchor camera {result['anchor']}; written to {result['file']}"
     )
 
 

@@ -47,6 +47,8 @@ class EvaluationSettings(MatchingSettings, ModelSettings):
     """Metres; truth at or beyond it is left out, predictions are clamped to it, and label-free scores stop there."""
     flip_fusion_of: Literal["depth", "inverse_depth"] = "depth"
     """With flip-fusion: fuse depth (as CVCDepth) or inverse depth (as SurroundDepth)."""
+    truth: Literal["lidar", "depth"] = "lidar"
+    """What depth is scored against: LiDARs, or depth images beside the pictures, as `simulate` records them."""
     lidar_tolerance: float = Field(LIDAR_TOLERANCE, ge=0, le=10)
     """Seconds that a LiDAR sweep may be from the image that it is the truth of."""
     no_occlusion_filter: bool = False
@@ -72,7 +74,8 @@ class EvaluationSettings(MatchingSettings, ModelSettings):
         """Settings of the scorer."""
         from cvcdepth_core.scoring.scores import ScoreSettings
 
-        return ScoreSettings(min_depth=self.min_depth, max_depth=self.max_depth)
+        parts = ("moving", "edges") if self.truth == "depth" else ()
+        return ScoreSettings(min_depth=self.min_depth, max_depth=self.max_depth, parts=parts)
 
     @property
     def occlusion(self) -> OcclusionFilter | None:

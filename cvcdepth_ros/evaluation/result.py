@@ -35,7 +35,15 @@ from cvcdepth_ros.evaluation.references import REFERENCES
 from cvcdepth_ros.evaluation.trained_on import SeenSets, seen_in_training, trained_parts
 
 SCHEMA = 2
-_DECIDE_WHAT_IS_MEASURED = ("rig", "base_frame", "tolerance", "lidar", "lidar_tolerance", "no_occlusion_filter")
+_DECIDE_WHAT_IS_MEASURED = (
+    "rig",
+    "base_frame",
+    "tolerance",
+    "lidar",
+    "lidar_tolerance",
+    "no_occlusion_filter",
+    "truth",
+)
 
 PROTOCOLS: tuple[EvaluationProtocol, ...] = ("image", "pool")
 

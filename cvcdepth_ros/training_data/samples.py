@@ -39,7 +39,8 @@ class NetworkRig:
     names: tuple[str, ...]
     anchor: int
     base_T_camera: NDArray[np.float64]
-    """[N, 4, 4] without the vehicle's motion."""
+    """[N, 4, 4] without the vehicle's motion; z = 0 is the base frame's, `ground_height` above it the ground."""
+    ground_height: float
     pairs: tuple[tuple[int, int], ...]
     """(camera, neighbour)."""
 
@@ -52,6 +53,7 @@ class NetworkRig:
             tuple(rig.names),
             index.anchor,
             np.stack([camera.base_T_camera for camera in rig.cameras]),
+            rig.ground_height,
             tuple(rig.neighbour_indices),
         )
 
@@ -66,11 +68,13 @@ class NetworkRig:
         """Join what samples have of their own with the rig's constants.
 
         That is pictures (uint8 [B, 3, N, H, W, 3], target first), poses [B, N, 4, 4], times and recorded poses of
-        `ReadSample`.
+        `ReadSample`. The batch's poses have the ground at z = 0.
         """
         samples = len(frames)
         masks = torch.from_numpy(self.preprocessor.valid).float()[:, None]
         intrinsics = torch.from_numpy(self.preprocessor.intrinsics).float()
+        base_T_camera = base_T_camera.clone()
+        base_T_camera[..., 2, 3] -= self.ground_height
         return RigBatch(
             frames=frames.permute(0, 1, 2, 5, 3, 4).contiguous().float() / 255,
             masks=masks.expand(samples, *masks.shape),
