@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from cvcdepth_core.errors import ConfigError, first_validation_message
-from cvcdepth_core.model_choices import DEFAULT, NOTICE, Backend, Precision, checkpoint_path
+from cvcdepth_core.model_choices import DEFAULT, NOTICE, Backend, FlipFusion, Precision, checkpoint_path
 
 if TYPE_CHECKING:
     from cvcdepth_core.estimator import DepthEstimator
@@ -73,11 +73,18 @@ class ModelSettings(Settings):
     """What is made of the network's depth: off leaves it, geometry compares pictures of neighbours and earlier ones."""
     refine_width: int = Field(160, ge=32, le=4096)
     """Refinement and confidence only: columns of the grid that pictures are compared on, at most; more is slower."""
+    flip_fusion: bool = False
+    """Run the network on mirrored pictures too and fuse both depths, as the paper's best rows do: twice the cost."""
 
     @property
     def checkpoint_path(self) -> Path | None:
         """The checkpoint's file; None for a network with random weights."""
         return None if self.untrained else checkpoint_path(self.checkpoint)
+
+    @property
+    def fusion(self) -> FlipFusion:
+        """What is fused."""
+        return "depth" if self.flip_fusion else "none"
 
     @property
     def notice(self) -> str:
@@ -90,7 +97,7 @@ class ModelSettings(Settings):
         """Return the checkpoint's network, or an untrained one; CheckpointError or ConfigError says what is wrong."""
         from cvcdepth_core.estimator import DepthEstimator
 
-        engine = self.model_dump(include={"backend", "precision", "cpu_fallback"})
+        engine = self.model_dump(include={"backend", "precision", "cpu_fallback"}) | {"flip_fusion": self.fusion}
         path = self._checked_path()
         if path is not None:
             return DepthEstimator.from_checkpoint(path, self.device, **engine)

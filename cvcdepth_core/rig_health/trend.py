@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from cvcdepth_core.stamps import NANOSECONDS
 
-
 _LEAST = 4
 """Measurements that are averaged, where there are so many."""
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvcdepth_core.files import nan_to_null
+from cvcdepth_core.rig.view import PicturePart
 from cvcdepth_core.scoring.confidence import CalibrationTable, Sparsification, confidence_samples, sparsification
 from cvcdepth_core.scoring.sparse_depth import SparseDepth
 from cvcdepth_core.surround_depth import SurroundDepth
@@ -84,14 +85,17 @@ class ConfidenceScorer:
         self._rows: dict[str, list[Sparsification]] = {name: [] for name in cameras}
         self._calibration = CalibrationTable.empty()
 
-    def add(self, surround: SurroundDepth, truth: Sequence[SparseDepth]) -> None:
-        """Measure one set, the truth in the order of the cameras; one without confidence is passed over."""
+    def add(self, surround: SurroundDepth, truth: Sequence[SparseDepth], parts: Sequence[PicturePart]) -> None:
+        """Measure one set; one without confidence is passed over.
+
+        Truth, and what of its picture the depth shows, are in the order of the cameras.
+        """
         if surround.confidence is None:
             return
-        for rows, depth, sure, known in zip(
-            self._rows.values(), surround.depth, surround.confidence, truth, strict=True
+        for rows, depth, sure, known, part in zip(
+            self._rows.values(), surround.depth, surround.confidence, truth, parts, strict=True
         ):
-            samples = confidence_samples(depth, sure, known, *self._limits)
+            samples = confidence_samples(depth, sure, known, *self._limits, part)
             rows.append(sparsification(samples))
             self._calibration = self._calibration + CalibrationTable.from_samples(samples)
 

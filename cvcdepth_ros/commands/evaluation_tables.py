@@ -59,6 +59,8 @@ def _lines(result: EvaluationResult, folder: Path) -> Iterator[str]:
             f"{seen.recording}: the model was trained on {seen.sets} of these {seen.scored} sets ({seen.trained_as}): "
             "its scores here do not tell how good it is elsewhere"
         )
+    if result.pose_score is not None:
+        yield f"pose network: {result.pose_score.describe()}"
     recordings = f"{len(result.recordings)} recording{'' if len(result.recordings) == 1 else 's'}"
     yield f"{len(result.sets)} sets of {recordings}, {result.truth_points} truth points"
     yield f"{folder}, of {result.model.id}"

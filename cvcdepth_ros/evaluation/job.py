@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from pydantic import Field, model_validator
 
+from cvcdepth_core.model_choices import FlipFusion
 from cvcdepth_ros.installation import package_version
 from cvcdepth_ros.settings import LIDAR_TOLERANCE, MatchingSettings, ModelSettings
 
@@ -44,6 +45,10 @@ class EvaluationSettings(MatchingSettings, ModelSettings):
     """Metres; truth at or below it is left out, predictions are clamped to it."""
     max_depth: float = Field(80.0, gt=0, le=1e4)
     """Metres; truth at or beyond it is left out, predictions are clamped to it, and label-free scores stop there."""
+    flip_fusion_of: Literal["depth", "inverse_depth"] = "depth"
+    """With flip-fusion: fuse depth (as CVCDepth) or inverse depth (as SurroundDepth)."""
+    truth: Literal["lidar", "depth"] = "lidar"
+    """What depth is scored against: LiDARs, or depth images beside the pictures, as `simulate` records them."""
     lidar_tolerance: float = Field(LIDAR_TOLERANCE, ge=0, le=10)
     """Seconds that a LiDAR sweep may be from the image that it is the truth of."""
     no_occlusion_filter: bool = False
@@ -60,11 +65,17 @@ class EvaluationSettings(MatchingSettings, ModelSettings):
         return self
 
     @property
+    def fusion(self) -> FlipFusion:
+        """What is fused."""
+        return self.flip_fusion_of if self.flip_fusion else "none"
+
+    @property
     def scores(self) -> ScoreSettings:
         """Settings of the scorer."""
         from cvcdepth_core.scoring.scores import ScoreSettings
 
-        return ScoreSettings(min_depth=self.min_depth, max_depth=self.max_depth)
+        parts = ("moving", "edges") if self.truth == "depth" else ()
+        return ScoreSettings(min_depth=self.min_depth, max_depth=self.max_depth, parts=parts)
 
     @property
     def occlusion(self) -> OcclusionFilter | None:

@@ -19,6 +19,7 @@ from cvcdepth_core.errors import RecordingError
 from cvcdepth_core.estimator import DepthPredictor
 from cvcdepth_core.rendering.agreement import PosedDepth
 from cvcdepth_core.rig.poses import Pose
+from cvcdepth_core.rig.view import PicturePart
 from cvcdepth_core.scoring.confidence_scores import ConfidenceScorer, ConfidenceScores
 from cvcdepth_core.scoring.consistency import AgreementTable, spatial_rows, temporal_rows
 from cvcdepth_core.scoring.ground_truth import overlap_pixels, sample_prediction
@@ -29,10 +30,12 @@ from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_core.visualization import Points
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.evaluation.job import EvaluationJob
+from cvcdepth_ros.evaluation.pose_scores import PoseScoring
 from cvcdepth_ros.evaluation.references import ReferenceScores, ReferenceScoring
 from cvcdepth_ros.messages.cloud_sources import describe_left_out_clouds
 from cvcdepth_ros.recordings.replay import DepthReplay, RecordedImage, SurroundReplay
 from cvcdepth_ros.recordings.rig import RecordedRig
+from cvcdepth_ros.recordings.true_depth import RecordedDepthImages
 from cvcdepth_ros.recordings.truth import RecordedTruth
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
 from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet
@@ -72,16 +75,34 @@ class MeasuredSet:
         """The depth with the cameras' places."""
         return PosedDepth.from_rig(self.estimated.result, self.estimated.rig, self.world_T_base)
 
+    @property
+    def parts(self) -> list[PicturePart]:
+        """What of each camera's picture the depth shows."""
+        size = self.estimated.result.depth.shape[1:]
+        return [camera.network_part(*size) for camera in self.estimated.rig.cameras]
+
     def samples(self) -> list[DepthSamples]:
         """Return what is scored of each camera."""
         rig, depth = self.estimated.rig, self.estimated.result.depth
         views = {camera.name: camera.rectified_view for camera in rig.cameras}
         found = []
-        for name, truth, prediction in zip(rig.names, self.truth, depth, strict=True):
+        for name, truth, prediction, part in zip(rig.names, self.truth, depth, self.parts, strict=True):
             others = [views[other] for other in rig.neighbours[name]]
             overlap = overlap_pixels(truth, views[name], others)
-            found.append(DepthSamples(sample_prediction(prediction, truth), truth.depth, overlap))
+            sampled = sample_prediction(prediction, truth, part)
+            found.append(DepthSamples(sampled, truth.depth, overlap, truth.parts))
         return found
+
+    def sky(self, far: float) -> tuple[int, int]:
+        """Return the pixels with depth that show the sky, and those among them whose depth is beyond `far` metres."""
+        pixels = seen = 0
+        for truth, prediction, part in zip(self.truth, self.estimated.result.depth, self.parts, strict=True):
+            rows, columns = truth.sky.T
+            sky = SparseDepth(rows, columns, np.zeros(len(rows)), truth.height, truth.width)
+            there = sample_prediction(prediction, sky, part)
+            pixels += int((~np.isnan(there)).sum())
+            seen += int((there > far).sum())
+        return pixels, seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +173,7 @@ class RecordingEvaluation:
         """`predictor` is the job's where it is loaded already; without it, it is loaded here."""
         self.job = job
         self.replay = SurroundReplay(recorded, job.settings)
-        self.truth = RecordedTruth(recorded, job.lidar, job.settings.lidar_tolerance)
+        self.truth = _truth(job, recorded)
         self.depths = DepthReplay(
             self.replay,
             predictor or job.settings.build_predictor(self.replay.rig),
@@ -221,6 +242,12 @@ class RecordingEvaluation:
         return MeasuredSet(estimated, truth, poses, lidar)
 
 
+def _truth(job: EvaluationJob, recorded: RecordedRig) -> RecordedTruth | RecordedDepthImages:
+    if job.settings.truth == "depth":
+        return RecordedDepthImages(recorded)
+    return RecordedTruth(recorded, job.lidar, job.settings.lidar_tolerance)
+
+
 @contextmanager
 def open_evaluation(job: EvaluationJob) -> Iterator[RecordingEvaluation]:
     """Open the job's recording; the errors of the family name what is missing.
@@ -280,9 +307,11 @@ class _Scoring:
         self._confidence = ConfidenceScorer(cameras, job.settings.min_depth, job.settings.max_depth)
         self._agreement = AgreementTable()
         self._earlier: tuple[int, PosedDepth] | None = None
+        self.poses = PoseScoring(job.settings.checkpoint_path)
         self._log_times = array("q")
         self.sets_with_truth = 0
         self.truth_points = 0
+        self.sky = np.zeros(2, np.int64)
 
     def add(self, measured: MeasuredSet) -> None:
         """Score one set; sets come in order."""
@@ -290,11 +319,15 @@ class _Scoring:
             samples = measured.samples()
             points = self._scorer.add(measured.stamp_ns, samples)
             self.references.add(measured.stamp_ns, samples, measured.truth)
-            self._confidence.add(measured.estimated.result, measured.truth)
+            self._confidence.add(measured.estimated.result, measured.truth, measured.parts)
         self.truth_points += points
+        if self._job.settings.truth == "depth":
+            self.sky += measured.sky(self._job.settings.max_depth)
         self.sets_with_truth += points > 0
         with self._latencies.measure("label-free"), torch.inference_mode():
             self._compare(measured)
+        with self._latencies.measure("pose network"):
+            self.poses.add(measured)
         self._log_times.append(measured.log_time)
 
     @property
@@ -345,6 +378,9 @@ def _summary(evaluation: RecordingEvaluation, scoring: _Scoring) -> dict[str, An
             "refused": depths.refused.count,
         },
         "truth_points": scoring.truth_points,
+        "pose_network": scoring.poses.result(),
+        "why_no_pose_network": scoring.poses.problem or None,
+        "sky": {"pixels": int(scoring.sky[0]), "far": int(scoring.sky[1])},
         "no_flat_ground": scoring.references.problem or None,
         "refused": depths.refused.reasons + replay.unreadable.reasons,
         "truth_refused": {"count": truth.refused.count, "reasons": truth.refused.reasons[:10]},

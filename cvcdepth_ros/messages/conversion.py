@@ -9,6 +9,7 @@ import array
 import sys
 from collections.abc import Callable
 from importlib import import_module
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,9 +28,26 @@ _BIG_ENDIAN_HOST = sys.byteorder == "big"
 
 
 def stamp_ns(message: Any) -> int:
-    """Return the stamp of a message with a header, in nanoseconds since the epoch."""
-    stamp = message.header.stamp
+    """Return the stamp of a message with a header, or of a video packet, in nanoseconds since the epoch."""
+    stamp = header_of(message).stamp
     return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
+
+
+def header_of(message: Any) -> Any:
+    """Return a message's header, or what stands for it in a `foxglove_msgs/CompressedVideo`."""
+    if hasattr(message, "header"):
+        return message.header
+    return SimpleNamespace(stamp=message.timestamp, frame_id=message.frame_id)
+
+
+def is_video_packet(message: Any) -> bool:
+    """Whether a message is one packet of a video stream, of the types in `VIDEO_TYPES`."""
+    return hasattr(message, "pts") or hasattr(message, "timestamp")
+
+
+def video_codec(packet: Any) -> str:
+    """Return what a video packet says of its codec."""
+    return str(packet.encoding if hasattr(packet, "encoding") else packet.format)
 
 
 def picture_from_message(

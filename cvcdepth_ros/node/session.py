@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """One active period of the node: its topics connected to the pipeline, and the state of each camera."""
 
+from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict
 from pathlib import Path
@@ -113,8 +114,8 @@ class SurroundSession:
             node.get_logger().warning(line)
 
     def _rig_transforms(self, opened: ExitStack) -> RigTransforms | None:
-        """Return what publishes the rig file's poses; None where it has none, or tf2_msgs is not installed."""
-        if all(camera.base_T_camera is None for camera in self._assembler.layout.cameras):
+        """Return what publishes poses that only the rig has; None where there are none, or without tf2_msgs."""
+        if all(camera.base_T_camera is None and not camera.is_turned for camera in self._assembler.layout.cameras):
             return None
         try:
             return opened.enter_context(closing(RigTransforms(self._node, self._assembler)))
@@ -232,16 +233,19 @@ class SurroundSession:
     def _close_pipeline(self) -> None:
         self._is_finished = self._pipeline.close()
 
-    def _on_image(self, camera: str, message: Any) -> None:
-        self._ages.record("receive (ROS time)", camera, exposure_times(stamp_ns(message), self._offsets_ns[camera]))
+    def _on_image(self, cameras: Sequence[str], message: Any) -> None:
+        taken = exposure_times(stamp_ns(message), self._offsets_ns[cameras[0]])
+        self._ages.record("receive (ROS time)", cameras[0], taken)
         megabytes = len(message.data) / 1e6
         if megabytes > self._max_image_mb:
-            self._watches[camera].used(f"image of {megabytes:.1f} MB, more than max_image_mb ({self._max_image_mb:g})")
+            too_large = f"image of {megabytes:.1f} MB, more than max_image_mb ({self._max_image_mb:g})"
+            for camera in cameras:
+                self._watches[camera].used(too_large)
             return
-        self._pipeline.add(camera, message)
+        self._pipeline.add(cameras, message)
 
-    def _on_camera_info(self, camera: str, message: Any) -> None:
-        if self._assembler.add_camera_info(camera, message):
+    def _on_camera_info(self, cameras: Sequence[str], message: Any) -> None:
+        if True in [self._assembler.add_camera_info(camera, message) for camera in cameras]:
             self._rebuild()
 
     def _on_transforms(self) -> None:
@@ -264,7 +268,7 @@ class SurroundSession:
             self._node.get_logger().error(str(error))
 
     def _publish(self, published: EstimatedSet[CameraImage]) -> None:
-        frame_ids = {name: self._assembler.frame_id(name) or "" for name in published.rig.names}
+        frame_ids = {name: self._assembler.view_frame_id(name) or "" for name in published.rig.names}
         parameters = read_parameters(self._node)
         self._needs_confidence = parameters.needs_confidence
         self._outputs.publish(published, frame_ids, parameters.cloud_limits)

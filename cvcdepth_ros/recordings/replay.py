@@ -6,7 +6,7 @@ skipped: there is no clock to keep up with, hence no mailbox.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import islice
 from typing import Any, NamedTuple
@@ -25,7 +25,6 @@ from cvcdepth_ros.messages.conversion import stamp_ns
 from cvcdepth_ros.messages.recorded_changes import moment_of
 from cvcdepth_ros.recordings.refusals import Refusals
 from cvcdepth_ros.recordings.rig import RecordedRig
-from cvcdepth_ros.recordings.rig_messages import add_camera_info
 from cvcdepth_ros.recordings.set_motion import RecordedSetMotion
 from cvcdepth_ros.settings import MatchingSettings, ModelSettings
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
@@ -84,8 +83,8 @@ class SurroundReplay:
 
     @property
     def frame_ids(self) -> dict[str, str]:
-        """Each camera's optical frame."""
-        return {name: self._assembler.frame_id(name) or "" for name in self.layout.names}
+        """The optical frame of each camera's picture."""
+        return {name: self._assembler.view_frame_id(name) or "" for name in self.layout.names}
 
     @property
     def calibration_changes(self) -> list[str]:
@@ -110,7 +109,7 @@ class SurroundReplay:
         `handlers` are given the messages of further topics in between, at their time; topics that are not in the
         recording are passed over.
         """
-        cameras = {camera.image_topic: camera.name for camera in self.layout.cameras}
+        cameras = self.layout.views_by_image
         infos = {camera.camera_info_topic for camera in self.layout.cameras}
         handlers = handlers or {}
         topics = {*cameras, *infos, *handlers} & self.recording.topics.keys()
@@ -135,23 +134,26 @@ class SurroundReplay:
 
     def _firing_offsets(self, start: int | None, stop: int | None) -> dict[str, float]:
         """Median seconds by which each camera's nearest image is later than the anchor's, stamp offsets subtracted."""
-        cameras = {camera.image_topic: camera for camera in self.layout.cameras}
+        cameras = self.layout.views_by_image
+        offsets_ns = {camera.name: camera.stamp_offset_ns for camera in self.layout.cameras}
         stamps: dict[str, list[float]] = {name: [] for name in self.layout.names}
         for message in islice(self.recording.messages(cameras, start, stop), _IMAGES_TO_EXPLAIN):
-            camera = cameras[message.topic]
             with suppress(RecordingError):
                 stamp = stamp_ns(self.recording.deserialize(message))
-                stamps[camera.name].append(exposure_times(stamp, camera.stamp_offset_ns) / NANOSECONDS)
+                for camera in cameras[message.topic]:
+                    stamps[camera].append(exposure_times(stamp, offsets_ns[camera]) / NANOSECONDS)
         anchor = np.array(stamps[self.layout.anchor_camera])
         return {name: _median_distance(anchor, np.array(found)) for name, found in stamps.items()}
 
-    def _add_image(self, camera: str, message: RecordedMessage) -> list[SurroundSet[RecordedImage]]:
+    def _add_image(self, cameras: Sequence[str], message: RecordedMessage) -> Iterator[SurroundSet[RecordedImage]]:
+        """Add an image for each of the cameras that are views of its lens."""
         try:
             image = self.recording.deserialize(message)
         except RecordingError as error:
-            self.unreadable.add(f"camera {camera}: {error}")
-            return []
-        return self._synchroniser.add(camera, stamp_ns(image), RecordedImage(image, message.log_time))
+            self.unreadable.add(f"camera {', '.join(cameras)}: {error}")
+            return
+        for camera in cameras:
+            yield from self._synchroniser.add(camera, stamp_ns(image), RecordedImage(image, message.log_time))
 
     def _add_camera_info(self, message: RecordedMessage) -> None:
         try:
@@ -161,7 +163,7 @@ class SurroundReplay:
             return
         if self._says_nothing_new(message.topic, info):
             return
-        if add_camera_info(self._assembler, message.topic, info):
+        if self._assembler.add_camera_info_on(message.topic, info):
             try:
                 self._rig = self._assembler.rig()
             except RigError as error:

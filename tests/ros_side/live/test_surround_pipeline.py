@@ -29,7 +29,7 @@ from cvcdepth_ros.recordings.rig import discover_rig
 from cvcdepth_ros.settings import ModelSettings
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
 from cvcdepth_ros.surround_sets.refinement import RefinementStage
-from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet, estimate_set, picture_or_error
+from cvcdepth_ros.surround_sets.set_estimation import EncodedImage, EstimatedSet, estimate_set, picture_or_error
 from cvcdepth_ros.surround_sets.synchronizer import SurroundSynchronizer
 
 TIMEOUT = 60.0
@@ -106,7 +106,7 @@ class Running:
 
     def feed(self, images: list[tuple[str, Any]]) -> None:
         for camera, message in images:
-            self.pipeline.add(camera, message)
+            self.pipeline.add([camera], message)
 
     def wait(self, condition: Callable[[], object]) -> None:
         deadline = time.monotonic() + TIMEOUT
@@ -208,6 +208,28 @@ def test_images_are_decoded_while_the_network_is_busy_with_the_set_before(start,
     decoded = running.latencies.summaries()["preprocess"].count
     running.feed(images[12:18])
     running.wait(lambda: running.latencies.summaries()["preprocess"].count >= decoded + 6)
+    assert not running.published
+
+
+def test_a_complete_set_is_decoded_where_the_network_will_be_free_before_the_next(
+    start, estimator, images, monkeypatch: pytest.MonkeyPatch
+):
+    """When its images came, the network was busy for longer than the next ones would need to come."""
+    slowed = Slowed(estimator)
+    running = start(slowed)
+    left = iter(images)
+
+    def feed_until(sets: int) -> None:
+        while running.mailbox.statistics().received < sets:
+            running.feed([next(left)])
+
+    is_free = lambda _: running.mailbox.statistics().received >= 2  # noqa: E731
+    monkeypatch.setattr(running.pipeline._pace, "is_free_within", is_free)
+    feed_until(sets=1)
+    assert slowed.entered.wait(TIMEOUT)
+    assert running.latencies.summaries()["preprocess"].count == 6
+    feed_until(sets=2)
+    running.wait(lambda: running.latencies.summaries()["preprocess"].count == 12)
     assert not running.published
 
 
@@ -435,7 +457,7 @@ class TooWide(Rectifier):
 def test_what_opencv_raises_costs_one_image_and_names_its_camera(layout, images):
     camera, message = images[0]
     calibration = next(c.calibration for c in layout.cameras if c.name == camera)
-    outcome = picture_or_error(message, camera, TooWide(calibration, 96, 160), StageLatencies())
+    outcome = picture_or_error(EncodedImage(message), camera, TooWide(calibration, 96, 160), StageLatencies())
     assert isinstance(outcome, ImageError)
     assert str(outcome).startswith(f"camera {camera}: error: OpenCV")
 
