@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cvcdepth_core.errors import RigError
 from cvcdepth_core.estimator import DepthPredictor
 from cvcdepth_core.files import nan_to_null
 from cvcdepth_core.refinement.drive import DriveRefiner
@@ -71,7 +72,7 @@ def compare_pictures(
     matching: MatchingSettings,
     progress: Progress = lambda _: None,
 ) -> ComparedPictures:
-    """Look at the sets of these parts; RigError when there is none."""
+    """Look at the sets of these parts; RigError when there are too few."""
     rig = recorded.layout.complete()
     search = MountSearch(rig.neighbour_indices, rig.names.index(rig.anchor))
     problems: list[str] = []
@@ -81,6 +82,10 @@ def compare_pictures(
         sets += found.look_at(part)
         problems += [found.problem] if found.problem else []
         progress((number + 1) / len(parts))
+    if sets <= _WARM_UP:
+        raise RigError(
+            f"{recorded.recording.path}: {sets} sets, more than {_WARM_UP} in a row are needed to compare pictures"
+        )
     has_odometry = recorded.vehicle_motion() is not None
     return ComparedPictures(rig, sets, search.result(), problems[0] if problems else "", has_odometry)
 
