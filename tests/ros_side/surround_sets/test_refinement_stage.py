@@ -82,7 +82,7 @@ def test_a_camera_that_is_absent_is_compared_with_nothing(drive):
     found = stage.finished(surround, one.surround_set, result)
     assert np.isnan(found.result.depth[2]).all()
     assert not found.result.confidence[2].any()
-    neighbours = dict(zip(stage.cameras, stage.last.depth.beside.tolist(), strict=True))
+    neighbours = dict(zip(stage.last.cameras, stage.last.refined.depth.beside.tolist(), strict=True))
     assert neighbours["front_left"] == 1  # two but for the one that is absent
 
 
