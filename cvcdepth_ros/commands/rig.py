@@ -70,7 +70,9 @@ def execute(arguments: argparse.Namespace) -> None:
         given = rig_layout(arguments)
         recorded = RecordedRig.from_recording(recording, given, arguments.base_frame)
         recorded = recorded if given is None else recorded.completed()
-        layout = _with_views(recorded.layout, arguments.view)
+        if arguments.view:
+            recorded = recorded.with_layout(_with_views(recorded.layout, arguments.view)).completed()
+        layout = recorded.layout
         layout = layout.model_copy(
             update={
                 "anchor": _anchor(layout, arguments.anchor),
@@ -137,6 +139,12 @@ def _view_degrees(entry: "CameraEntry", text: str) -> float:
 
 
 def _anchor(layout: "RigLayout", wanted: str | None) -> str:
+    """Return the camera that is asked for, of a lens with several views the middle one, else the rig's."""
+    from cvcdepth_core.rig.wide_lenses import from_left_to_right, lens_name
+
+    lenses = {lens_name(names): from_left_to_right(layout, names) for names in layout.views_by_image.values()}
+    if wanted in lenses:
+        return lenses[wanted][(len(lenses[wanted]) - 1) // 2]
     if wanted is not None and wanted not in layout.names:
         raise ConfigError(f"anchor: no camera is called {wanted}; there are {', '.join(layout.names)}")
     return wanted or layout.anchor_camera

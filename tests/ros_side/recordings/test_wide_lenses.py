@@ -110,7 +110,10 @@ def test_rig_writes_what_is_found(drive: Path, tmp_path: Path, capsys: pytest.Ca
 VIEW_OPTIONS = {
     "one angle for all": (["--view", "100"], {"ahead": 100.0, "port": 100.0}),
     "one of them": (["--view", "port=80"], {"ahead_l": 70.0, "ahead_m": 70.0, "ahead_r": 70.0, "port": 80.0}),
-    "a part in two": (["--view", "130", "--view", "port=90"], {"ahead_l": 75.0, "ahead_r": 75.0, "port": 90.0}),
+    "a part in two": (
+        ["--view", "130", "--view", "port=90", "--anchor", "ahead"],
+        {"ahead_l": 75.0, "ahead_r": 75.0, "port": 90.0},
+    ),
     "the whole lens": (["--view", "90", "--view", "lens"], dict.fromkeys(NAMES, 70.0)),
 }
 
@@ -119,6 +122,7 @@ VIEW_OPTIONS = {
 def test_rig_takes_as_much_of_each_lens_as_is_asked_for(options: list, views: dict, drive: Path, tmp_path: Path):
     assert main(["rig", str(drive), "-o", str(tmp_path / "rig.yaml"), *options]) == 0
     layout = load_rig_layout(tmp_path / "rig.yaml")
+    assert layout.anchor == next(name for name in ("ahead", "ahead_m", "ahead_l") if name in layout.names)
     assert {camera.name: camera.view.hfov for camera in layout.cameras} == {
         name: pytest.approx(hfov) for name, hfov in views.items()
     }
