@@ -104,8 +104,8 @@ class RigLayout(BaseModel):
     anchor: str | None = None
     """The camera whose stamp a set carries and whose motion the pose network estimates; without it, the first."""
     aspect: Aspect = "crop"
-    """How pictures come into a network of another shape, by more than 10 %: what is too much is cut off (crop), borders
-    are left empty (pad), or pixels become wider or narrower than high (stretch)."""
+    """How pictures come into a network of another shape, by more than 10 %: rows that are too many are cut off (crop),
+    borders are left empty (pad), or pixels become wider or narrower than high (stretch)."""
     cameras: tuple[CameraEntry, ...]
     """The cameras, in the order in which every array of a set holds them."""
 

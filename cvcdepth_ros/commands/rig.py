@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--aspect", choices=get_args(Aspect),
-        help="how pictures come into a network of another shape: cut off, with empty borders, or stretched [crop]",
+        help="how pictures come into a network of another shape: rows cut off, with empty borders, or stretched [crop]",
     )  # fmt: skip
     parser.add_argument("--masks", action="store_true", help="find the vehicle's own body (reads the whole recording)")
     parser.add_argument("--force", action="store_true", help="overwrite the rig file and its masks")
