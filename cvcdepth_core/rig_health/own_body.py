@@ -109,7 +109,8 @@ class SelfOcclusionFinder:
         lasts = lasting > _LEAST_PERSISTENCE * textures
         seeds = self._examined & (textures > _SEED_TEXTURE) & (ratios < _SEED_RATIO) & lasts
         grown = self._examined & (ratios < _GROWN_RATIO)
-        return np.stack([~_enclosed(_connected(*still)) for still in zip(grown, seeds, strict=True)])
+        seen = self.preprocessor.valid
+        return np.stack([~_enclosed(_connected(*still)) for still in zip(grown, seeds, seen, strict=True)])
 
     def raw_mask(self, camera: int, scene: NDArray[np.bool_]) -> NDArray[np.uint8]:
         """Return `scene` [H, W] of a camera as a mask of its raw image's size: 0 on the vehicle, 255 elsewhere."""
@@ -146,21 +147,26 @@ def _smooth_grey(picture: Picture) -> NDArray[np.float32]:
     return grey
 
 
-def _connected(grown: NDArray[np.bool_], seeds: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the parts of `grown` that hold enough of `seeds`, at the picture's border too, with gaps closed."""
+def _connected(grown: NDArray[np.bool_], seeds: NDArray[np.bool_], seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the parts of `grown` that hold enough of `seeds`, at the border of what is `seen` too, with gaps closed."""
     least = _MIN_SEED_SHARE * seeds.size
     still = _parts(grown, lambda part: int((part & seeds).sum()) >= least)
     closed = cv2.morphologyEx(still.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((_CLOSING, _CLOSING), np.uint8)) > 0
     # What floats inside the picture is a vehicle that drives along, not our own, even if a smooth road leads from it to
     # the border.
-    at_border = seeds & ~_inner(seeds.shape)
+    at_border = seeds & ~_inner(seen)
     return _parts(closed, lambda part: int((part & at_border).sum()) >= _MIN_BORDER_SEEDS)
 
 
-def _inner(shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Return what is not near the left, the right or the lower border."""
-    inner = np.zeros(shape, bool)
-    inner[:-_BORDER, _BORDER:-_BORDER] = True
+def _inner(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return what is not near the left, the right or the lower border of what the lens shows."""
+    inner = np.zeros_like(seen)
+    left, right, below = (
+        seen[:-_BORDER, : -2 * _BORDER],
+        seen[:-_BORDER, 2 * _BORDER :],
+        seen[_BORDER:, _BORDER:-_BORDER],
+    )
+    inner[:-_BORDER, _BORDER:-_BORDER] = left & right & below
     return inner
 
 
