@@ -67,6 +67,15 @@ class Rig:
     base_frame: str
     anchor: str
     given_neighbours: Mapping[str, tuple[str, ...]]
+    ground_height: float = 0.0
+    """Metres of the ground in the base frame: negative where the base frame lies above it."""
+
+    @property
+    def poses_above_ground(self) -> NDArray[np.float64]:
+        """Each camera's pose [N, 4, 4] in the frame below the base frame, turned alike, whose z = 0 is the ground."""
+        poses = np.stack([camera.base_T_camera for camera in self.cameras])
+        poses[:, 2, 3] -= self.ground_height
+        return poses
 
     @property
     def names(self) -> list[str]:

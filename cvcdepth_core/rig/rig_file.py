@@ -106,6 +106,9 @@ class RigLayout(BaseModel):
     aspect: Aspect = "crop"
     """How pictures come into a network of another shape, by more than 10 %: rows that are too many are cut off (crop),
     borders are left empty (pad), or pixels become wider or narrower than high (stretch)."""
+    ground_height: float = Field(default=0.0, ge=-20, le=20, allow_inf_nan=False)
+    """Metres of the ground in the base frame, below the vehicle as it stands; 0 where the base frame lies on the ground
+    (REP 105's base_footprint), negative where it is higher. Networks that are told their rig need it."""
     cameras: tuple[CameraEntry, ...]
     """The cameras, in the order in which every array of a set holds them."""
 
@@ -170,6 +173,7 @@ class RigLayout(BaseModel):
             base_frame=self.base_frame,
             anchor=self.anchor_camera,
             given_neighbours={c.name: c.neighbours for c in self.cameras if c.neighbours is not None},
+            ground_height=self.ground_height,
         )
 
 

@@ -148,7 +148,7 @@ def _smooth_grey(picture: Picture) -> NDArray[np.float32]:
 
 
 def _connected(grown: NDArray[np.bool_], seeds: NDArray[np.bool_], seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the parts of `grown` that hold enough of `seeds`, at the border of what is `seen` too, with gaps closed."""
+    """Return the parts of `grown` that hold enough of `seeds`, at the border of what is `seen` too, gaps closed."""
     least = _MIN_SEED_SHARE * seeds.size
     still = _parts(grown, lambda part: int((part & seeds).sum()) >= least)
     closed = cv2.morphologyEx(still.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((_CLOSING, _CLOSING), np.uint8)) > 0
@@ -161,12 +161,8 @@ def _connected(grown: NDArray[np.bool_], seeds: NDArray[np.bool_], seen: NDArray
 def _inner(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return what is not near the left, the right or the lower border of what the lens shows."""
     inner = np.zeros_like(seen)
-    left, right, below = (
-        seen[:-_BORDER, : -2 * _BORDER],
-        seen[:-_BORDER, 2 * _BORDER :],
-        seen[_BORDER:, _BORDER:-_BORDER],
-    )
-    inner[:-_BORDER, _BORDER:-_BORDER] = left & right & below
+    left, right = seen[:-_BORDER, : -2 * _BORDER], seen[:-_BORDER, 2 * _BORDER :]
+    inner[:-_BORDER, _BORDER:-_BORDER] = left & right & seen[_BORDER:, _BORDER:-_BORDER]
     return inner
 
 

@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from cvcdepth_core.rig.lens_use import lens_uses
 from cvcdepth_ros.checks.context import CheckContext, CheckResult
 from cvcdepth_ros.messages.recorded_cameras import find_recorded_cameras
-from cvcdepth_ros.messages.recorded_changes import find_calibration_changes
 from cvcdepth_ros.messages.transforms import frame_name
 from cvcdepth_ros.recordings.fixed_frames import MOVING_TRANSFORMS
 from cvcdepth_ros.recordings.rig import topic_problems
@@ -73,10 +72,8 @@ def check_camera_infos(context: CheckContext) -> CheckResult:
     distinct = ", ".join(dict.fromkeys(sizes.values()))
     remedy = "calibrate the camera at the size that is recorded, or correct camera_info or the rig file"
     found = f"{len(sizes)} valid, of the images' size ({distinct})"
-    changes = []
-    if not problems and not context.has_rig_file:
-        changes = find_calibration_changes(context.recording, assembler.layout, context.first_messages)
-    if changes:
+    changes = context.calibrations.changes if context.calibrations else []
+    if changes and not problems:
         remedy = "take the parts before and after as two recordings"
         return CheckResult("warning", f"{found}; {'; '.join(changes[:_MAX_LISTED])}", remedy, {"changes": changes})
     return _judged(problems, remedy, found, {"sizes": sizes})

@@ -29,14 +29,17 @@ from cvcdepth_ros.node.diagnostics import (
     inference_status,
     model_status,
     overlap_status,
+    refinement_status,
     synchronisation_status,
 )
+from cvcdepth_ros.node.motion_input import MotionInput
 from cvcdepth_ros.node.parameters import read_parameters, unknown_qos_overrides
 from cvcdepth_ros.node.publishers import SurroundOutputs
 from cvcdepth_ros.node.rig_transforms import RigTransforms
 from cvcdepth_ros.node.subscriptions import CameraInputs, StaticTransformInput
 from cvcdepth_ros.settings import NodeParameters
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
+from cvcdepth_ros.surround_sets.refinement import RefinementStage
 from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet
 from cvcdepth_ros.surround_sets.synchronizer import SurroundSynchronizer
 from cvcdepth_ros.surround_sets.trace_file import TraceFile
@@ -73,6 +76,7 @@ class SurroundSession:
         """Why images do not arrive that were sent; empty while they do."""
         self._progress = SetProgress(self._synchroniser.required, parameters.tolerance, parameters.max_age)
         self._is_finished = False
+        self._needs_confidence = parameters.needs_confidence
         with ExitStack() as opened:
             trace = None
             if parameters.trace:
@@ -83,8 +87,13 @@ class SurroundSession:
                 transforms = StaticTransformInput(node, assembler.transforms, self._on_transforms)
                 opened.enter_context(closing(transforms))
             self._transforms = self._rig_transforms(opened) if parameters.publish_tf else None
-            outputs = SurroundOutputs(node, layout.names, parameters.depth_encoding, self.latencies)
+            outputs = SurroundOutputs(node, layout.names, parameters, self.latencies)
             self._outputs = opened.enter_context(closing(outputs))
+            motion = MotionInput(node, layout.base_frame, parameters.odometry_topic)
+            self._motion = opened.enter_context(closing(motion))
+            self._refinement = RefinementStage(
+                parameters, motion.poses.poses_at, self._wants_confidence, self.latencies, parameters.publish_odometry
+            )
             self._pipeline = SurroundPipeline(
                 estimator,
                 self._synchroniser,
@@ -94,6 +103,7 @@ class SurroundSession:
                 self._publish,
                 self._watch_overlaps if parameters.overlap_monitor else lambda _: None,
                 self.latencies,
+                self._refinement,
             )
             opened.callback(self._close_pipeline)
             inputs = CameraInputs(node, layout, parameters.reliable, self._on_image, self._on_camera_info)
@@ -113,9 +123,14 @@ class SurroundSession:
             self._node.get_logger().info("the rig file's poses are not on /tf_static: tf2_msgs is not installed")
             return None
 
+    def _wants_confidence(self) -> bool:
+        return self._needs_confidence or self._outputs.wants_confidence()
+
     def poll(self) -> None:
         """Subscribe image topics that have appeared, and follow how far the sets come. To be called regularly."""
         self._inputs.connect()
+        if self._refinement.is_active:
+            self._motion.connect()
         if self._transforms is not None:
             self._transforms.poll()
         counts = {**asdict(self._mailbox.statistics()), **self._pipeline.counters}
@@ -201,6 +216,7 @@ class SurroundSession:
             ),
             model_status(self._estimator),
             *([overlap_status(self._overlaps)] if self._overlaps else []),
+            *([refinement_status(self._refinement, self._motion.poses)] if self._refinement.is_active else []),
         ]
 
     def _setup_troubles(self, camera: str) -> list[Trouble]:
@@ -253,8 +269,9 @@ class SurroundSession:
 
     def _publish(self, published: EstimatedSet[CameraImage]) -> None:
         frame_ids = {name: self._assembler.view_frame_id(name) or "" for name in published.rig.names}
-        limits = read_parameters(self._node).cloud_limits
-        self._outputs.publish(published, frame_ids, limits)
+        parameters = read_parameters(self._node)
+        self._needs_confidence = parameters.needs_confidence
+        self._outputs.publish(published, frame_ids, parameters.cloud_limits)
         newest = max(published.surround_set.times_ns.values())
         self._ages.record("age of newest image at publish (ROS time)", "", newest)
 

@@ -18,14 +18,17 @@ from cvcdepth_core.errors import CvcDepthError, RecordingError, RigError
 from cvcdepth_core.estimator import DepthPredictor, SurroundDepthEstimator
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.stamps import NANOSECONDS, exposure_times
+from cvcdepth_core.surround_depth import SurroundDepth
 from cvcdepth_ros.bags import RecordedMessage
 from cvcdepth_ros.messages.camera_info import content_of, is_usable
 from cvcdepth_ros.messages.conversion import stamp_ns
 from cvcdepth_ros.messages.recorded_changes import moment_of
 from cvcdepth_ros.recordings.refusals import Refusals
 from cvcdepth_ros.recordings.rig import RecordedRig
-from cvcdepth_ros.settings import MatchingSettings
+from cvcdepth_ros.recordings.set_motion import RecordedSetMotion
+from cvcdepth_ros.settings import MatchingSettings, ModelSettings
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
+from cvcdepth_ros.surround_sets.refinement import RefinementStage
 from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet, estimate_set
 from cvcdepth_ros.surround_sets.synchronizer import (
     SurroundSet,
@@ -180,14 +183,30 @@ class DepthReplay:
     """Estimates every set of a replay. A set that cannot be estimated is left out and counted in `refused`."""
 
     def __init__(
-        self, replay: SurroundReplay, estimator: DepthPredictor, latencies: StageLatencies | None = None
+        self,
+        replay: SurroundReplay,
+        estimator: DepthPredictor,
+        latencies: StageLatencies | None = None,
+        settings: ModelSettings | None = None,
+        wants_confidence: bool = False,
     ) -> None:
-        """Prepare for the replay's rig; RigError names a mask that does not fit."""
+        """Prepare for the replay's rig; RigError names a mask that does not fit.
+
+        `settings` say whether depth is refined (None: it is not); without, confidence may be wanted all the same.
+        """
         self.refused = Refusals()
         self.latencies = latencies or StageLatencies()
         self.estimator = estimator
         self._replay = replay
         self._surround = SurroundDepthEstimator(replay.rig, estimator)
+        is_compared = wants_confidence or (settings is not None and settings.refine != "off")
+        self._motion = RecordedSetMotion.of(replay.recorded) if is_compared else None
+        self.refinement = RefinementStage(
+            settings or ModelSettings.model_validate({"refine": "off"}),
+            self._motion.poses_at if self._motion else lambda _: None,
+            lambda: wants_confidence,
+            self.latencies,
+        )
 
     def sets(
         self,
@@ -196,18 +215,24 @@ class DepthReplay:
         handlers: Handlers | None = None,
         stamp_ns: int | None = None,
     ) -> Iterator[EstimatedSet[RecordedImage]]:
-        """Yield the sets of `SurroundReplay.sets` with their depth; with a stamp, the set of that stamp only."""
+        """Yield the sets of `SurroundReplay.sets` with their depth; with a stamp, the set of that stamp only.
+
+        Those before it are estimated all the same where its depth is refined with them.
+        """
         for surround_set in self._replay.sets(start, stop, handlers):
-            if stamp_ns not in (None, surround_set.stamp_ns):
+            is_wanted = stamp_ns in (None, surround_set.stamp_ns)
+            if not is_wanted and not self.refinement.is_active:
                 continue
             try:
                 surround = self._current_surround()
                 messages = {name: image.message for name, image in surround_set.images.items()}
                 result = estimate_set(messages, surround, self.latencies, self._replay.required)
+                estimated = self._finished(surround, surround_set, result)
             except CvcDepthError as error:
                 self.refused.add(f"set at {surround_set.stamp_ns} ns: {error}")
             else:
-                yield EstimatedSet(surround_set, surround.rig, result)
+                if is_wanted:
+                    yield estimated
 
     def why_no_set(self, start: int | None = None, stop: int | None = None) -> str:
         """Return why `sets` yielded none: what was refused, else `SurroundReplay.why_no_set`."""
@@ -215,6 +240,19 @@ class DepthReplay:
             if refusals.count:
                 return str(refusals)
         return self._replay.why_no_set(start, stop)
+
+    @property
+    def surround(self) -> SurroundDepthEstimator:
+        """What estimated the last set."""
+        return self._surround
+
+    def _finished(
+        self, surround: SurroundDepthEstimator, surround_set: SurroundSet[RecordedImage], result: SurroundDepth
+    ) -> EstimatedSet[RecordedImage]:
+        if self._motion is not None and self.refinement.is_active:
+            with self.latencies.measure("motion"):
+                self._motion.read_to(max(image.log_time for image in surround_set.images.values()))
+        return self.refinement.finished(surround, surround_set, result)
 
     def _current_surround(self) -> SurroundDepthEstimator:
         if self._surround.rig is not self._replay.rig:

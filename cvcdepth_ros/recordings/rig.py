@@ -20,7 +20,7 @@ from cvcdepth_ros.messages.camera_discovery import (
 from cvcdepth_ros.messages.recorded_cameras import find_recorded_cameras
 from cvcdepth_ros.messages.recorded_changes import find_calibration_changes
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
-from cvcdepth_ros.messages.transforms import TransformTree
+from cvcdepth_ros.messages.transforms import TransformTree, frame_name
 from cvcdepth_ros.recordings.motion import MotionLink, VehicleMotion, find_motion_link
 from cvcdepth_ros.recordings.rig_messages import RigMessages
 
@@ -39,7 +39,7 @@ class RecordedRig:
         self._messages = messages
         assembler = messages.assembler(layout)
         for problem in assembler.problems().values():
-            raise RigError(f"{recording.path}: {problem}")
+            raise RigError(f"{recording.path}: {problem}{_remedy(assembler)}")
         self.transforms: TransformTree = assembler.transforms
         """The fixed transforms."""
 
@@ -135,6 +135,14 @@ def _split_lenses(layout: RigLayout) -> Iterator[str]:
         if len(names) > 1:
             views = ", ".join(from_left_to_right(layout, names))
             yield f"camera {lens_name(names)}: shown by {views}, views of its one lens"
+
+
+def _remedy(assembler: RigAssembler) -> str:
+    """Return what helps where none of the transforms knows the base frame."""
+    frames = assembler.transforms.frames
+    if not frames or frame_name(assembler.layout.base_frame) in frames:
+        return ""
+    return "; name the vehicle's frame with --base-frame, or as base_frame in the rig file"
 
 
 def discover_rig(recording: Recording, base_frame: str = "base_link") -> RigLayout:

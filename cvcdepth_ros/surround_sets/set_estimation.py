@@ -11,6 +11,7 @@ from cvcdepth_core.errors import ImageError
 from cvcdepth_core.estimator import SurroundDepthEstimator
 from cvcdepth_core.images.decoding import Picture, Reduction
 from cvcdepth_core.images.rectifier import Rectifier
+from cvcdepth_core.refinement.drive import VisualMotion
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.surround_depth import SurroundDepth
 from cvcdepth_ros.messages.conversion import picture_from_message
@@ -32,6 +33,8 @@ class EstimatedSet(Generic[T]):
     """As it was at this set: calibrations may change meanwhile."""
     result: SurroundDepth
     """Arrays in the order of the rig's cameras."""
+    visual: VisualMotion | None = None
+    """What the pictures tell of the vehicle's motion; None where they were not followed."""
 
 
 def estimate_set(
