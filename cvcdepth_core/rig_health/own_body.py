@@ -34,6 +34,7 @@ _MIN_CAMERA_HEIGHT = 0.5  # metres above the ground, where the base frame lies a
 _WINDOW = 9  # pixels over which changes are summed up
 _SEED_TEXTURE, _SEED_RATIO, _GROWN_RATIO = 0.7, 0.7, 1.5  # grey levels per pixel; change by change of one pixel's shift
 _LEAST_PERSISTENCE = 0.6  # share of a seed's texture that is left in the mean of the pictures; of scene 0.1 to 0.4
+_FADING_CHANGE, _FADING_PERSISTENCE = 0.2, 0.35  # grey levels; share of the texture: what is no body however smooth
 _NOISE_PERCENTILE = 5
 _MAX_NOISE = 0.5  # grey levels that may count as noise: where no body is seen, the stillest picture is of a road
 _MIN_SEED_SHARE = 0.002
@@ -105,10 +106,13 @@ class SelfOcclusionFinder:
             np.stack([cv2.blur(image / self.pairs, (_WINDOW, _WINDOW)) for image in sums])
             for sums in (self._changes, self._shift_changes, abs(self._slopes))
         )
-        ratios = np.maximum(changes - self._noise(changes), 0) / np.maximum(textures, 1e-3)
+        excess = np.maximum(changes - self._noise(changes), 0)
+        ratios = excess / np.maximum(textures, 1e-3)
         lasts = lasting > _LEAST_PERSISTENCE * textures
         seeds = self._examined & (textures > _SEED_TEXTURE) & (ratios < _SEED_RATIO) & lasts
-        grown = self._examined & (ratios < _GROWN_RATIO)
+        # A smooth road, and the shadow on it of a vehicle that follows, change little, but not only by noise.
+        fades = (excess > _FADING_CHANGE) & (lasting < _FADING_PERSISTENCE * textures)
+        grown = self._examined & (ratios < _GROWN_RATIO) & ~fades
         seen = self.preprocessor.valid
         return np.stack([~_enclosed(_connected(*still)) for still in zip(grown, seeds, seen, strict=True)])
 
