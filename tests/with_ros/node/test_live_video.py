@@ -22,8 +22,8 @@ from cvcdepth_core.rig.rig_file import load_rig_layout, save_rig_layout
 from cvcdepth_ros.node.subscriptions import CameraInputs
 
 PACKAGES = "not built here (make messages)"
-FRAMES = 40
-KEY_EVERY = 10
+FRAMES = 20
+KEY_EVERY = 5
 TOPICS = {"front": "/camera/front/image_raw/ffmpeg", "left": "/camera/left/video"}
 
 
@@ -51,7 +51,7 @@ class Videos:
         self._classes = classes
         pictures = {name: [_picture(cameras, name, number % 10) for number in range(FRAMES)] for name in TOPICS}
         codecs = {"front": "h264", "left": "hevc"}
-        self._packets = {name: encoded(pictures[name], codecs[name], key_every=KEY_EVERY) for name in TOPICS}
+        self._packets = {name: encoded(pictures[name], codecs[name], key_every=KEY_EVERY, crf=35) for name in TOPICS}
         self._count = dict.fromkeys(TOPICS, 3)  # the node joins late: between key frames
         self.lost: set[str] = set()
         """Cameras whose next packet gets lost."""
@@ -88,7 +88,7 @@ def test_cameras_that_send_video_get_depth_from_their_next_key_frame_on(graph: R
     videos = Videos(graph, cameras)
     graph.subscribe(PointCloud2, CLOUD)
     graph.subscribe(Image, *DEPTH.values())
-    graph.start_node(rig=rig, untrained=True, height=64, width=96, max_age=0.0)
+    graph.start_node(rig=rig, untrained=True, height=64, width=96, max_age=0.0, reliable=True)
     graph.await_subscribers([*TOPICS.values()])
     cameras.run_until(lambda: graph.received[CLOUD], "a cloud")
     for name in CAMERAS:
