@@ -7,6 +7,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from cvcdepth_core.images.decoding import Picture
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.rig.rig_file import RigLayout
 from cvcdepth_core.stamps import exposure_times
+from cvcdepth_core.training.config import RecordingsConfig
 from cvcdepth_ros.bags import RecordedMessage, Recording
 from cvcdepth_ros.messages.camera_discovery import RECORDED_IMAGE_TYPES
 from cvcdepth_ros.messages.conversion import picture_from_message
@@ -33,6 +35,7 @@ from cvcdepth_ros.surround_sets.synchronizer import SurroundSet, SurroundSynchro
 Status = Literal["passed", "warning", "failed", "skipped"]
 
 _DEFAULTS = MatchingSettings()
+_TRAINING = RecordingsConfig()
 _KEPT_SWEEPS = 3
 _SHOWN_SETS = 3
 
@@ -63,6 +66,10 @@ class CheckOptions:
     """The vehicle's frame where no rig file names it."""
     lidar: tuple[str, ...] | None = None
     """LiDAR topics; None for all of the recording, see `RigMessages.lidars`."""
+    training: RecordingsConfig = _TRAINING
+    """How training samples would be chosen."""
+    checkpoint: Path | None = None
+    """Weights whose pose network is compared with the recorded motion."""
     start: int | None = None
     """First log time to read, ns."""
     stop: int | None = None
@@ -100,6 +107,8 @@ class CheckContext:
         """Of each topic that may be a camera's; of CameraInfos where there is a rig file."""
         layout = self._chosen_layout(rig_layout)
         self.assembler = None if layout is None else self._assembled(messages, layout)
+        if self.assembler is not None and not self.has_rig_file:
+            self.assembler.split_wide_lenses()
         """None where the cameras make no rig, or the transforms contradict each other."""
         self.lidars = messages.lidars if options.lidar is None else options.lidar
         """The topics of the LiDARs."""
@@ -172,11 +181,13 @@ class CheckContext:
         sets = self.match(self.layout, self.options.tolerance)
         topics = {camera.name: camera.image_topic for camera in self.layout.cameras}
         for found in (sets[len(sets) * (2 * i + 1) // (2 * _SHOWN_SETS)] for i in range(min(_SHOWN_SETS, len(sets)))):
-            wanted = {(topics[camera], log_time): camera for camera, log_time in found.images.items()}
+            wanted: dict[tuple[str, int], list[str]] = defaultdict(list)
+            for camera, log_time in found.images.items():
+                wanted[topics[camera], log_time].append(camera)
             times = found.images.values()
             messages = self.recording.messages(set(topics.values()), min(times), max(times) + 1)
             read = {
-                wanted[key]: message for message in messages if (key := (message.topic, message.log_time)) in wanted
+                camera: message for message in messages for camera in wanted.get((message.topic, message.log_time), ())
             }
             pictures = {camera: self._picture(camera, message) for camera, message in read.items()}
             yield {camera: picture for camera, picture in pictures.items() if not isinstance(picture, str)}

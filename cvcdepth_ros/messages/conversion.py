@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable
 from importlib import import_module
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,6 +74,13 @@ def calibration_from_message(message: Any, camera: str) -> Calibration:
     return read_camera_info(message, camera).calibration
 
 
+class Covariances(NamedTuple):
+    """Of an odometry message, each [6, 6]: along and about x, y and z."""
+
+    pose: NDArray[np.float64]
+    twist: NDArray[np.float64]
+
+
 class MessageFactory:
     """Builds messages from arrays, with the message classes of one library."""
 
@@ -92,6 +99,10 @@ class MessageFactory:
         if encoding != "32FC1":
             raise ConfigError(f"depth encoding '{encoding}' is not one of 32FC1, 16UC1")
         return self._image(stamp, frame_id, depth, encoding)
+
+    def confidence_image(self, stamp: int, frame_id: str, confidence: NDArray[np.float32]) -> Any:
+        """Build the 32FC1 image of `confidence` [H, W] in [0, 1]."""
+        return self._image(stamp, frame_id, confidence, "32FC1")
 
     def colour_image(self, stamp: int, frame_id: str, picture: Picture) -> Any:
         """Build the rgb8 image of `picture` [H, W, 3]."""
@@ -130,6 +141,31 @@ class MessageFactory:
             row_step=point_step * width,
             data=self._bytes(cloud),
             is_dense=cloud.ndim == 2,
+        )
+
+    def odometry(
+        self, stamp: int, frame_id: str, base_frame: str, pose: Pose, twist: NDArray[np.float64], errors: Covariances
+    ) -> Any:
+        """Build the Odometry of `base_frame` at `pose` in `frame_id`; `twist` [6] is in the base frame (m/s, rad/s)."""
+        where, velocity = self._transform(pose), twist.tolist()
+        vector = self._class("geometry_msgs/msg/Vector3")
+        point = self._class("geometry_msgs/msg/Point")(
+            x=where.translation.x, y=where.translation.y, z=where.translation.z
+        )
+        return self._class("nav_msgs/msg/Odometry")(
+            header=self._header(stamp, frame_id),
+            child_frame_id=base_frame,
+            pose=self._class("geometry_msgs/msg/PoseWithCovariance")(
+                pose=self._class("geometry_msgs/msg/Pose")(position=point, orientation=where.rotation),
+                covariance=errors.pose.ravel(),
+            ),
+            twist=self._class("geometry_msgs/msg/TwistWithCovariance")(
+                twist=self._class("geometry_msgs/msg/Twist")(
+                    linear=vector(**dict(zip("xyz", velocity[:3], strict=True))),
+                    angular=vector(**dict(zip("xyz", velocity[3:], strict=True))),
+                ),
+                covariance=errors.twist.ravel(),
+            ),
         )
 
     def string(self, content: str) -> Any:

@@ -53,6 +53,7 @@ class LiveRigDiscovery:
         if not settled or self._assembler is None or self._assembler.problems():
             return None
         try:
+            self._assembler.split_wide_lenses()
             self._assembler.order_around_vehicle()
         except CvcDepthError as error:  # cameras that are each complete but together no rig
             self.refuse(str(error))
@@ -108,7 +109,7 @@ class LiveRigDiscovery:
             self._subscriptions = [self._subscribe(entry, self._assembler) for entry in entries]
 
     def _subscribe(self, entry: CameraEntry, assembler: RigAssembler) -> Subscription:
-        callback = partial(assembler.add_camera_info, entry.name)
+        callback = partial(assembler.add_camera_info_on, entry.camera_info_topic)
         return self._node.create_subscription(
             CameraInfo, entry.camera_info_topic, lambda message: callback(message), qos_profile_sensor_data
         )

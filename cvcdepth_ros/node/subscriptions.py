@@ -43,10 +43,12 @@ class CameraInputs:
         node: Node,
         layout: RigLayout,
         reliable: bool,
-        on_image: Callable[[str, Any], None],
-        on_camera_info: Callable[[str, Any], None],
+        on_image: Callable[[list[str], Any], None],
+        on_camera_info: Callable[[list[str], Any], None],
     ) -> None:
-        """Both callbacks get the camera's name first; they run on the executor's thread and must be short.
+        """Both callbacks get the camera's name first, or the names of all that are views of one lens.
+
+        They run on the executor's thread and must be short.
 
         ConfigError names a camera_info topic that cannot be subscribed.
         """
@@ -54,8 +56,10 @@ class CameraInputs:
         self._cameras: dict[str, _CameraInput] = {}
         try:
             for camera in layout.cameras:
-                callbacks = partial(on_image, camera.name), partial(on_camera_info, camera.name)
-                self._cameras[camera.name] = _CameraInput(node, camera, reliable, *callbacks)
+                names = layout.views_by_image[camera.image_topic]
+                if camera.name == names[0]:
+                    callbacks = partial(on_image, names), partial(on_camera_info, names)
+                    self._cameras |= dict.fromkeys(names, _CameraInput(node, camera, reliable, *callbacks))
         except ConfigError:
             self.close()
             raise
@@ -63,7 +67,7 @@ class CameraInputs:
     @property
     def image_topics(self) -> list[str]:
         """The graph's names of the cameras' image topics, whether they are there or not."""
-        return [camera.image_topic for camera in self._cameras.values()]
+        return [camera.image_topic for camera in self._inputs]
 
     @property
     def lost(self) -> dict[str, int]:
@@ -73,7 +77,7 @@ class CameraInputs:
     def connect(self) -> None:
         """Subscribe the image topics that have appeared since the last call."""
         types = topic_types(self._node)
-        for camera in self._cameras.values():
+        for camera in self._inputs:
             camera.connect(types)
 
     def troubles(self) -> dict[str, list[Trouble]]:
@@ -83,12 +87,17 @@ class CameraInputs:
 
     def close(self) -> None:
         """Drop all subscriptions."""
-        for camera in self._cameras.values():
+        for camera in self._inputs:
             camera.close()
+
+    @property
+    def _inputs(self) -> list["_CameraInput"]:
+        """Each once, whether one camera's or that of all views of a lens."""
+        return list(dict.fromkeys(self._cameras.values()))
 
 
 class _CameraInput:
-    """One camera's subscriptions."""
+    """The subscriptions of one camera, or of all that are views of one lens."""
 
     def __init__(
         self,

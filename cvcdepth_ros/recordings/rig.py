@@ -11,6 +11,7 @@ from pydantic import ValidationError
 
 from cvcdepth_core.errors import RecordingError, RigError, first_validation_message
 from cvcdepth_core.rig.rig_file import CameraEntry, RigLayout
+from cvcdepth_core.rig.wide_lenses import from_left_to_right, lens_name
 from cvcdepth_ros.bags import Recording
 from cvcdepth_ros.messages.camera_discovery import (
     CAMERA_INFO_TYPE,
@@ -57,7 +58,13 @@ class RecordedRig:
         for problem in topic_problems(recording, chosen):
             raise RecordingError(f"{recording.path}: {problem}")
         found = cls(recording, chosen, messages)
-        return found.completed() if layout is None else found
+        return found if layout is not None else found.with_split_lenses().completed()
+
+    def with_split_lenses(self) -> RecordedRig:
+        """Return the same with two or three cameras in the place of each wide lens, see `split_wide_lenses`."""
+        assembler = self.assembler()
+        assembler.split_wide_lenses()
+        return self.with_layout(assembler.layout)
 
     def completed(self) -> RecordedRig:
         """Return the same with all that was collected in its layout, the cameras ordered around the vehicle."""
@@ -95,6 +102,7 @@ class RecordedRig:
             *found.choices,
             *found.left_out,
             *self.open_assembler()[0].notes,
+            *_split_lenses(self.layout),
             *(f"{change}; the rig is that of what comes before" for change in changes),
         ]
 
@@ -120,6 +128,13 @@ class RecordedRig:
     @cached_property
     def _motion_link(self) -> MotionLink | None:
         return find_motion_link(self.recording, self.layout.base_frame, self.transforms)
+
+
+def _split_lenses(layout: RigLayout) -> Iterator[str]:
+    for names in layout.views_by_image.values():
+        if len(names) > 1:
+            views = ", ".join(from_left_to_right(layout, names))
+            yield f"camera {lens_name(names)}: shown by {views}, views of its one lens"
 
 
 def _remedy(assembler: RigAssembler) -> str:
