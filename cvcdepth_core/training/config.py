@@ -13,12 +13,14 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from cvcdepth_core.errors import ConfigError, validation_messages
 from cvcdepth_core.files import load_yaml
 from cvcdepth_core.model_choices import EncoderName
+from cvcdepth_core.networks.pose import MAX_TRANSLATION
 from cvcdepth_core.networks.registry import DepthModelSpec
 from cvcdepth_core.training.augmentation import ColorJitterConfig, FlipMode
 from cvcdepth_core.training.model import PoseMethod
 from cvcdepth_core.training.objective import ObjectiveConfig
 
 ExposureMotion = Literal["auto", "recorded", "network", "none"]
+MotionSource = Literal["auto", "recorded", "network"]
 
 _BASE_KEY = "base"
 
@@ -52,11 +54,23 @@ class RecordingsConfig(_Section):
     """The last share of every recording's surround sets that is never trained on."""
     min_travel: float = Field(default=0.1, ge=0, allow_inf_nan=False)
     """Metres between a sample's target and each of its context frames, at least; nearer sets are passed over."""
+    max_travel: float = Field(default=MAX_TRANSLATION, gt=0, allow_inf_nan=False)
+    """Metres between them at most, where motion is recorded; with `motion: network` never more than the 4 that the pose
+    network can tell."""
     min_image_change: float = Field(default=2.0, ge=0, allow_inf_nan=False)
     """Instead of `min_travel` where no motion is recorded: mean absolute difference of the anchor camera's small grey
     pictures, of 255."""
+    further_travels: tuple[float, ...] = ()
+    """Where `motion` is recorded: further least distances, in metres; every epoch draws for each target whether it is
+    `min_travel` or one of these. Longer ways show depth that is far away, and the pose network other speeds."""
     max_interval: float = Field(default=0.5, gt=0, allow_inf_nan=False)
-    """Seconds from a target to a context frame, at most: a longer gap of the recording is not bridged."""
+    """Seconds from a target to a context frame, at most: a longer gap of the recording is not bridged. Where motion is
+    recorded, one and a half times the recording's own time from set to set is allowed too."""
+    motion: MotionSource = "network"
+    """From where the losses know how the cameras moved between a sample's sets: `network` (the pose network's answer,
+    as in the published method), `recorded` (odometry or /tf, from exposure to exposure of each camera, which the pose
+    network is taught too, see `objective.recorded_motion`), or `auto` (recorded where a recording has some, else of the
+    network). Recorded motion gives the scale, so that a camera needs no neighbour then."""
     exposure_motion: ExposureMotion = "auto"
     """How the vehicle moved between the exposures of one set, which gives the place of each camera when it fired:
     `recorded` (odometry or /tf), `network` (as the pose network says, at constant velocity between two sets), `auto`
@@ -75,6 +89,21 @@ class RecordingsConfig(_Section):
         return {True: "auto", False: "none"}[value] if isinstance(value, bool) else value
 
 
+class WorldsConfig(_Section):
+    """How views of rendered worlds become samples; calibration and truth follow every change of the picture."""
+
+    zoom: float = Field(default=1.5, ge=1, le=4)
+    """A random window of the picture, as wide as the picture or down to one of this many parts of it."""
+    squeeze: float = Field(default=0.07, ge=0, le=0.5)
+    """Standard deviation of the logarithm of the pixels' width over their height."""
+    angle_error: float = Field(default=0.5, ge=0, le=10)
+    """Degrees, standard deviation of pitch and roll that the network is told wrongly."""
+    height_error: float = Field(default=0.04, ge=0, le=0.5)
+    """Share of the camera's height, standard deviation, by which the network is told it wrongly."""
+    held_out: float = Field(default=0.03, ge=0, lt=1)
+    """The last share of the drives, which is scored and never trained on."""
+
+
 class OptimizerConfig(_Section):
     """Adam, its learning-rate schedule, and limits on a step."""
 
@@ -88,6 +117,12 @@ class OptimizerConfig(_Section):
     """Epochs after each of which the learning rate is multiplied by `decay_factor`."""
     decay_factor: float = Field(default=0.1, gt=0, le=1)
     """See `decay_after_epochs`."""
+    schedule: Literal["steps", "cosine"] = "steps"
+    """`steps` is that of the two fields before; `cosine` goes from `learning_rate` to a hundredth of it in a run."""
+    warm_up: int = Field(default=0, ge=0)
+    """Steps in which the learning rate rises from nothing."""
+    encoder_rate: float = Field(default=1.0, gt=0, le=1)
+    """Share of the learning rate that the encoders have: less for what begins with ImageNet's weights."""
     weight_decay: float = Field(default=0.0, ge=0)
     """Decoupled (AdamW); 0 is the published Adam."""
     samples_per_step: int = Field(default=4, ge=1)
@@ -128,8 +163,8 @@ class EvaluationConfig(_Section):
 class TrainingConfig(_Section):
     """Everything that determines a training run."""
 
-    dataset: Literal["ddad", "nuscenes", "recording"] = "ddad"
-    """Where samples come from; of the data sets there is no reader yet."""
+    dataset: Literal["ddad", "nuscenes", "recording", "worlds"] = "ddad"
+    """Where samples come from: recordings, or shards of `simulate`; of the data sets there is no reader yet."""
     depth: DepthModelSpec
     """The depth network; checkpoints carry this."""
     pose: PoseConfig = PoseConfig()
@@ -140,6 +175,8 @@ class TrainingConfig(_Section):
     """Changes to the images that the networks see; the losses compare the unchanged ones."""
     recordings: RecordingsConfig = RecordingsConfig()
     """For `dataset: recording`: which moments become samples, and how they are read."""
+    worlds: WorldsConfig = WorldsConfig()
+    """For pre-training on rendered worlds: how their views become samples."""
     optimizer: OptimizerConfig = OptimizerConfig()
     """Adam, its learning-rate schedule, and limits on a step."""
     evaluation: EvaluationConfig = EvaluationConfig()
