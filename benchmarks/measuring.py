@@ -16,6 +16,8 @@ import os
 import platform
 import resource
 import statistics
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -59,6 +61,18 @@ def measure_in_turns(cases: Mapping[str, Callable[[], object]], rounds: int, war
         for name, work in cases.items():
             timings[name].add(work)
     return timings
+
+
+@contextlib.contextmanager
+def busy_processes(count: int) -> Iterator[None]:
+    """Have so many processes do nothing but use a processor, beside what the block measures."""
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
 
 
 def json_lines(
