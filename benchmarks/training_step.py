@@ -10,6 +10,8 @@
 one writes it at first: one view after the other (camera_loop.py), plain Adam, the allocator as it comes. "networks" and
 "objective" are the parts of our step. `--against` names checkouts of other commits, whose trainers make steps too.
 
+`GOMP_SPINCOUNT=100000` in the environment lets idle threads spin, which `finetune` does not.
+
 Every measurement has a process of its own, for the peak memory is its; cases take turns. Depth begins at 10 m: with the
 1 to 2 m of random weights, neighbouring cameras would have nothing in common.
 """
@@ -107,7 +109,9 @@ def measured_there(case: str, checkout: Path, size: str, options: argparse.Names
     arguments = [f"--{name.replace('_', '-')}={getattr(options, name)}" for name in passed]
     finished = subprocess.run(
         [sys.executable, __file__, f"--case={case}", f"--sizes={size}", *arguments],
-        env=os.environ | {"PYTHONPATH": str(checkout), "OMP_NUM_THREADS": str(options.threads), "GOMP_SPINCOUNT": "0"},
+        env={"GOMP_SPINCOUNT": "0"}
+        | os.environ
+        | {"PYTHONPATH": str(checkout), "OMP_NUM_THREADS": str(options.threads)},
         stdout=subprocess.PIPE,
         check=True,
     )
