@@ -523,7 +523,8 @@ def test_what_a_recording_lost_is_told_and_not_counted_as_held_out(config, tmp_p
         entries[i] = entries[i]._replace(cdr=bytes(JAZZY.serialize_cdr(content, entries[i].type)))
     blind = recordings.write_rosbag2(tmp_path / "blind", entries)
     (blind / "blind_1.mcap").write_bytes(b"")
-    one_step = config(optimizer={"epochs": 1, "samples_per_step": 9})
+    third = {"held_out": 0.3, "min_travel": 0.1}
+    one_step = config(optimizer={"epochs": 1, "samples_per_step": 9}, recordings=third)
     skipped = ("--skip", "brightness", *CHEAP)
     assert finetune(one_step, tmp_path / "run", *skipped, bags=(SAMPLE, blind)) in (PROMOTED, NOT_PROMOTED)
     lost = f"{blind}: not everything could be read: {blind}: metadata.yaml does not list blind_1.mcap, not read"
@@ -531,7 +532,7 @@ def test_what_a_recording_lost_is_told_and_not_counted_as_held_out(config, tmp_p
     result = json.loads((tmp_path / "run" / "finetune.json").read_text())
     assert lost in result["warnings"]
     assert f"; not scored: {blind}: no set: 3 refused, the first: set at " in result["verdict"]["reason"]
-    assert [entry["held_out_sets"] for entry in result["recordings"]] == [6, 3]
+    assert [entry["held_out_sets"] for entry in result["recordings"]] == [3, 0]
 
 
 def test_a_lidar_that_is_named_and_not_there_is_told_before_the_first_step(config, tmp_path, capsys):
