@@ -16,7 +16,8 @@ from cvcdepth_core.model_choices import FlipFusion, Precision
 from cvcdepth_core.networks import DepthNetwork, build_depth_network, disparity_to_depth
 from cvcdepth_core.networks.checkpoint import load_checkpoint
 from cvcdepth_core.networks.mirroring import fuse_with_mirrored, mirrored_pictures
-from cvcdepth_core.networks.registry import DepthModelSpec
+from cvcdepth_core.networks.registry import RIG_CONDITIONED, DepthModelSpec
+from cvcdepth_core.rig.ground import refuse_unlikely_ground
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.surround_depth import SurroundDepth, SurroundPictures
 
@@ -147,13 +148,18 @@ class SurroundDepthEstimator:
     """
 
     def __init__(self, rig: Rig, estimator: DepthPredictor, known: "SurroundDepthEstimator | None" = None) -> None:
-        """`known` is an estimator whose maps are taken over for the cameras that have not changed."""
+        """Prepare the maps; those of `known` are taken over for the cameras that have not changed.
+
+        RigError names the camera where the network is told the rig, and the rig cannot be right about the ground.
+        """
+        if isinstance(estimator, DepthEstimator) and estimator.spec.network == RIG_CONDITIONED:
+            refuse_unlikely_ground(rig)
         self.rig = rig
         self.estimator = estimator
         self.preprocessor: SurroundPreprocessor = SurroundPreprocessor(
             rig, estimator.spec.height, estimator.spec.width, known.preprocessor if known else None
         )
-        self._base_T_camera = np.stack([camera.base_T_camera for camera in rig.cameras])
+        self._base_T_camera = rig.poses_above_ground
 
     def warm_up(self) -> None:
         """Estimate black pictures, so that what an engine does but once for so many cameras is done."""

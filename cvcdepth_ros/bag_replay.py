@@ -18,6 +18,7 @@ from cvcdepth_ros.commands import (
     import_weights,
     inspect,
     play,
+    pretrain,
     rig,
     run,
     simulate,
@@ -57,6 +58,7 @@ COMMANDS: Mapping[str, Command] = {
     "bench": bench,
     "export": export,
     "simulate": simulate,
+    "pretrain": pretrain,
 }
 
 

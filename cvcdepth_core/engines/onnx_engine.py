@@ -16,15 +16,17 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from cvcdepth_core.engines.conditioning import KeptConditioning
 from cvcdepth_core.engines.engine import DeviceMemoryError, best_chunk, image_by_image
 from cvcdepth_core.engines.example_rigs import ring_of_cameras
 from cvcdepth_core.engines.rewriting import RewrittenDepthNet
 from cvcdepth_core.errors import EngineError
 from cvcdepth_core.model_choices import Precision
-from cvcdepth_core.networks import DepthNet, DepthNetwork, RigImages
+from cvcdepth_core.networks import ConditionedNetwork, DepthNet, DepthNetwork, RigImages
 from cvcdepth_core.networks.registry import DepthModelSpec
 
 INPUT, OUTPUT = "images", "disparity"
+CONDITIONING = "conditioning"
 MOST_CAMERAS = 12
 """Images that a TensorRT engine takes at once."""
 
@@ -36,13 +38,19 @@ def onnx_model(network: DepthNetwork, spec: DepthModelSpec) -> bytes:
     """Return the network as an ONNX model.
 
     The published network becomes `images` [B, 3, H, W] in [0, 1] to `disparity` [B, 1, H, W], of any B, H and W; H and
-    W are multiples of 32, those of `spec` are what the network was trained for. Any other one takes the fields of
+    W are multiples of 32, those of `spec` are what the network was trained for. A network that is told its rig takes
+    `conditioning` [B, C, H, W] too, which is made of each camera's calibration once. Any other one takes the fields of
     `RigImages` by their names and gives `disparity` [1, N, 1, H, W], of any N, at the size of `spec`.
     """
     if isinstance(network, DepthNet):
         images = {INPUT: torch.zeros(1, 3, spec.height, spec.width)}
         return _exported(RewrittenDepthNet(network), images, {0: "cameras", 2: "height", 3: "width"})
     rig = ring_of_cameras(spec.height, spec.width)
+    if isinstance(network, ConditionedNetwork):
+        alone = rig.of_cameras([0])
+        inputs = {INPUT: alone.images[0], CONDITIONING: network.conditioning(alone)[0]}
+        axes = {0: "cameras", 2: "height", 3: "width"}
+        return _exported(_OnConditioning(copy.deepcopy(network).eval()), inputs, axes)
     return _exported(_OnTensors(copy.deepcopy(network).eval()), rig._asdict(), {1: "cameras"})
 
 
@@ -56,6 +64,17 @@ class _OnTensors(nn.Module):
     def forward(self, *parts: Tensor) -> Tensor:
         disparity: Tensor = self._network(RigImages(*parts))
         return disparity
+
+
+class _OnConditioning(nn.Module):
+    """A network that is told its rig, of images and conditioning."""
+
+    def __init__(self, network: ConditionedNetwork) -> None:
+        super().__init__()
+        self._network = network
+
+    def forward(self, images: Tensor, conditioning: Tensor) -> Tensor:
+        return self._network.disparity(images, conditioning)
 
 
 def _exported(network: nn.Module, inputs: dict[str, Tensor], axes: dict[int, str]) -> bytes:
@@ -93,12 +112,16 @@ class OnnxRuntimeEngine:
         self.model = onnx_model(network, spec)
         self._session = _session(self.model, [(provider, options)])
         self._takes_images = isinstance(network, DepthNet)
+        self._told = KeptConditioning(network) if isinstance(network, ConditionedNetwork) else None
         self._inputs = [given.name for given in self._session.get_inputs()]
 
     def disparity(self, rig: RigImages) -> Tensor:
         """See `DisparityEngine`."""
         if self._takes_images:
             return image_by_image(lambda images: _run(self._session, {INPUT: images}), rig)
+        if self._told is not None:
+            told = self._told(rig)
+            return image_by_image(lambda images: _run(self._session, {INPUT: images, CONDITIONING: told}), rig)
         return _run(self._session, {name: getattr(rig, name) for name in self._inputs})
 
 

@@ -5,14 +5,16 @@ from cvcdepth_core.networks.depth import INPUT_STRIDE, DepthNet, disparity_to_de
 from cvcdepth_core.networks.encoders import Encoder
 from cvcdepth_core.networks.pose import PoseNet
 from cvcdepth_core.networks.registry import NETWORKS, DepthModelSpec, build_depth_network
-from cvcdepth_core.networks.rig_images import DepthNetwork, RigImages
+from cvcdepth_core.networks.rig_images import ConditionedNetwork, DepthNetwork, DepthOutputs, RigImages
 
 __all__ = [
     "INPUT_STRIDE",
     "NETWORKS",
+    "ConditionedNetwork",
     "DepthModelSpec",
     "DepthNet",
     "DepthNetwork",
+    "DepthOutputs",
     "Encoder",
     "PoseNet",
     "RigImages",

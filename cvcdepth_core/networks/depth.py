@@ -50,14 +50,18 @@ class DepthNet(DepthNetwork):
 
         Raises ImageError when H or W is not a multiple of 32 or below 64.
         """
-        height, width = images.shape[-2:]
-        if height % INPUT_STRIDE or width % INPUT_STRIDE or min(height, width) < MIN_INPUT_SIZE:
-            raise ImageError(
-                f"depth network: input is {width}x{height} (width x height), both must be multiples of {INPUT_STRIDE} "
-                f"and at least {MIN_INPUT_SIZE}"
-            )
+        refuse_input_size(*images.shape[-2:])
         disparity: Tensor = self.depth_decoder(self.depth_encoder(images))
         return disparity
+
+
+def refuse_input_size(height: int, width: int) -> None:
+    """Raise ImageError when one of them is not a multiple of 32 or below 64."""
+    if height % INPUT_STRIDE or width % INPUT_STRIDE or min(height, width) < MIN_INPUT_SIZE:
+        raise ImageError(
+            f"depth network: input is {width}x{height} (width x height), both must be multiples of {INPUT_STRIDE} "
+            f"and at least {MIN_INPUT_SIZE}"
+        )
 
 
 class DepthDecoder(nn.Module):

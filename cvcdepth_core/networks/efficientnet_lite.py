@@ -107,7 +107,11 @@ class EfficientNetLite0Body(nn.Module):
 
     def forward(self, x: Tensor) -> list[Tensor]:
         """Map [B, C, H, W], H and W multiples of 32, to features at H/2, H/4, H/8, H/16 and H/32."""
-        x = F.relu6(self.stem_norm(self.stem(x)), inplace=True)
+        return self.after_stem(self.stem(x))
+
+    def after_stem(self, x: Tensor) -> list[Tensor]:
+        """Map what the first convolution gives, [B, C, H/2, W/2], to the same features."""
+        x = F.relu6(self.stem_norm(x), inplace=True)
         features = []
         for index, stage in enumerate(self.stages):
             x = stage(x)
@@ -128,8 +132,12 @@ class EfficientNetLite0Encoder(nn.Module):
 
     def forward(self, images: Tensor) -> list[Tensor]:
         """Return the features of `images` [B, C, H, W] in [0, 1], at H/2 ... H/32."""
-        features: list[Tensor] = self.encoder((images * _PIXEL_SCALE - _PIXEL_MEAN) / _PIXEL_STD)
+        features: list[Tensor] = self.encoder(self.normalised(images))
         return features
+
+    def normalised(self, images: Tensor) -> Tensor:
+        """Return `images` in [0, 1] with the mean and spread that the weights are made for."""
+        return (images * _PIXEL_SCALE - _PIXEL_MEAN) / _PIXEL_STD
 
     @torch.no_grad()
     def adapt_imagenet_state(self, state: dict[str, Tensor]) -> dict[str, Tensor]:

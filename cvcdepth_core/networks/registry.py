@@ -18,10 +18,13 @@ from pydantic import (
 
 from cvcdepth_core.model_choices import ENCODERS
 from cvcdepth_core.networks.depth import INPUT_STRIDE, MIN_INPUT_SIZE, DepthNet
+from cvcdepth_core.networks.rig_conditioned import RigConditionedNet
 from cvcdepth_core.networks.rig_images import DepthNetwork
 
 PER_CAMERA = "per_camera"
 """The published network, which looks at every camera on its own."""
+RIG_CONDITIONED = "rig_conditioned"
+"""The network that is told its rig: see `RigConditionedNet`."""
 
 
 class DepthModelSpec(BaseModel):
@@ -64,6 +67,14 @@ class DepthModelSpec(BaseModel):
         return encoder
 
     @model_validator(mode="after")
+    def _encoder_is_the_networks(self) -> DepthModelSpec:
+        if self.network == RIG_CONDITIONED and self.encoder != RigConditionedNet.ENCODER:
+            raise ValueError(
+                f"encoder is {self.encoder}, but the network {RIG_CONDITIONED} has {RigConditionedNet.ENCODER}"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _depth_range_is_ordered(self) -> DepthModelSpec:
         if self.min_depth >= self.max_depth:
             raise ValueError(f"min_depth {self.min_depth} must be below max_depth {self.max_depth}")
@@ -83,5 +94,8 @@ def build_depth_network(spec: DepthModelSpec) -> DepthNetwork:
     return NETWORKS[spec.network](spec)
 
 
-NETWORKS: dict[str, Callable[[DepthModelSpec], DepthNetwork]] = {PER_CAMERA: lambda spec: DepthNet(spec.encoder)}
+NETWORKS: dict[str, Callable[[DepthModelSpec], DepthNetwork]] = {
+    PER_CAMERA: lambda spec: DepthNet(spec.encoder),
+    RIG_CONDITIONED: lambda spec: RigConditionedNet(spec.min_depth, spec.max_depth, spec.focal_scale),
+}
 """Each kind's name in checkpoints and training files, and what builds one with random weights."""

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -26,7 +26,7 @@ class RigImages(NamedTuple):
     intrinsics: Tensor
     """[B, N, 3, 3] in pixels of H x W, pixel centres at the integers."""
     base_T_camera: Tensor
-    """[B, N, 4, 4] camera (optical frame) to vehicle, metres."""
+    """[B, N, 4, 4] camera (optical frame) to vehicle, metres; z = 0 is the ground (`Rig.poses_above_ground`)."""
     present: Tensor
     """[B, N] bool."""
     masks: Tensor
@@ -54,6 +54,22 @@ class RigImages(NamedTuple):
         return RigImages(*(part.to(device, dtype if part.is_floating_point() else None) for part in self))
 
 
+class DepthOutputs(NamedTuple):
+    """All that a network says of each pixel, [B, N, 1, H, W] each; None is what it does not say."""
+
+    disparity: Tensor
+    """In (0, 1)."""
+    sky: Tensor | None = None
+    """Logit of the sky."""
+    log_uncertainty: Tensor | None = None
+    """Natural logarithm of the error of log depth that is to be expected."""
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> DepthOutputs:
+        """Return what `change` makes of each."""
+        sky, log_uncertainty = (None if part is None else change(part) for part in self[1:])
+        return DepthOutputs(change(self.disparity), sky, log_uncertainty)
+
+
 class DepthNetwork(nn.Module, ABC):
     """A network that gives depth for all cameras of a rig; a checkpoint's `network` names its class.
 
@@ -69,6 +85,25 @@ class DepthNetwork(nn.Module, ABC):
     @abstractmethod
     def forward(self, rig: RigImages) -> Tensor:
         """Return the disparity [B, N, 1, H, W] in (0, 1); that of absent cameras means nothing."""
+
+    def details(self, rig: RigImages) -> DepthOutputs:
+        """Return the disparity and what the network says beside it."""
+        return DepthOutputs(self(rig))
+
+
+class ConditionedNetwork(DepthNetwork):
+    """A network whose cameras are independent, and which sees of the rig nothing but an image made of its calibration.
+
+    That image is the same for every set, so engines make it once and give it to the network beside the pictures.
+    """
+
+    @abstractmethod
+    def conditioning(self, rig: RigImages) -> Tensor:
+        """Return [B, N, C, H, W], made of `rig`'s calibration and of the size of its images."""
+
+    @abstractmethod
+    def disparity(self, images: Tensor, conditioning: Tensor) -> Tensor:
+        """Return the disparity [M, 1, H, W] in [0, 1] of images [M, 3, H, W] and their conditioning [M, C, H, W]."""
 
 
 def _float32(array: np.ndarray[Any, Any], device: torch.device | str) -> Tensor:

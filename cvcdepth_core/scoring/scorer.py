@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +25,12 @@ class DepthSamples(NamedTuple):
     """[M] metres."""
     overlap: NDArray[np.bool_]
     """[M] whether a neighbouring camera sees the point too."""
+    parts: Mapping[str, NDArray[np.bool_]] = MappingProxyType({})
+    """[M] each: `SparseDepth.parts`."""
+
+    def of(self, part: str) -> NDArray[np.bool_]:
+        """Return which pixels [M] belong to a part; none where the truth does not tell it."""
+        return self.parts.get(part, np.zeros(len(self.truth), dtype=bool))
 
 
 class SurroundScorer:
@@ -56,7 +63,7 @@ class SurroundScorer:
 
     def _close_pool(self) -> None:
         stamps, sets = zip(*self._pooled_sets, strict=True)
-        joined = [DepthSamples(*map(np.concatenate, zip(*images, strict=True))) for images in zip(*sets, strict=True)]
+        joined = [_joined(images, self._settings.parts) for images in zip(*sets, strict=True)]
         self._pools.add(stamps[0], *self._measure(joined))
         self._pooled_sets.clear()
 
@@ -94,7 +101,17 @@ def _within_limits(image: DepthSamples, settings: ScoreSettings) -> DepthSamples
     """Keep the truth inside the limits; a prediction of 0 or less is none, like NaN."""
     kept = (image.truth > settings.min_depth) & (image.truth < settings.max_depth)
     prediction = np.where(image.prediction > 0, image.prediction, np.nan)[kept]
-    return DepthSamples(_clamp(prediction, settings), image.truth[kept], image.overlap[kept])
+    parts = {name: mask[kept] for name, mask in image.parts.items()}
+    return DepthSamples(_clamp(prediction, settings), image.truth[kept], image.overlap[kept], parts)
+
+
+def _joined(images: Sequence[DepthSamples], parts: Sequence[str]) -> DepthSamples:
+    return DepthSamples(
+        np.concatenate([image.prediction for image in images]),
+        np.concatenate([image.truth for image in images]),
+        np.concatenate([image.overlap for image in images]),
+        {name: np.concatenate([image.of(name) for image in images]) for name in parts},
+    )
 
 
 def _clamp(prediction: NDArray[np.float64], settings: ScoreSettings) -> NDArray[np.float64]:
@@ -106,5 +123,5 @@ def _sums_by_group(image: DepthSamples, settings: ScoreSettings) -> list[ErrorSu
     """Add up the errors of every group."""
     bins = np.digitize(image.truth, settings.range_edges)
     ranges = [bins == i for i, _ in enumerate(settings.range_names, start=1)]
-    masks = [np.ones(len(image.truth), dtype=bool), *ranges, image.overlap]
+    masks = [np.ones(len(image.truth), dtype=bool), *ranges, image.overlap, *map(image.of, settings.parts)]
     return [sum_errors(image.prediction[mask], image.truth[mask]) for mask in masks]

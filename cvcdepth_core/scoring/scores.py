@@ -51,6 +51,8 @@ class ScoreSettings(BaseModel):
     """Metres of true depth at which range bins begin; the last one is open. None: there are no bins."""
     pool: int = Field(default=4, ge=1)
     """Consecutive images of a camera that form one pool."""
+    parts: tuple[str, ...] = ()
+    """Names of parts of the pixels that are measured apart, where the truth tells them (`SparseDepth.parts`)."""
 
     @model_validator(mode="after")
     def _check(self) -> ScoreSettings:
@@ -71,7 +73,7 @@ class ScoreSettings(BaseModel):
     @property
     def groups(self) -> list[str]:
         """The names of all groups of pixels that are measured."""
-        return [ALL, *self.range_names, OVERLAP]
+        return [ALL, *self.range_names, OVERLAP, *self.parts]
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,10 @@ class SparseDepth:
     """[M] metres along the optical axis."""
     height: int
     width: int
+    parts: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
+    """By name, which of the pixels [M] belong to a part that is scored apart."""
+    sky: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+    """[K, 2] rows and columns of the pixels that are known to show the sky."""
 
     def __len__(self) -> int:
         return len(self.depth)
@@ -45,7 +49,9 @@ class SparseDepth:
         return image
 
     def __getitem__(self, kept: NDArray[np.bool_]) -> SparseDepth:
-        return SparseDepth(self.rows[kept], self.columns[kept], self.depth[kept], self.height, self.width)
+        parts = {name: mask[kept] for name, mask in self.parts.items()}
+        picked = self.rows[kept], self.columns[kept], self.depth[kept]
+        return SparseDepth(*picked, self.height, self.width, parts, self.sky)
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,8 @@ class RigBatch:
     """
 
     frames: Tensor
-    """[B, 1 + F, N, 3, H, W] in [0, 1]: the target frame, then the context frames (-1, +1). Never augmented."""
+    """[B, 1 + F, N, 3, H, W] in [0, 1]: the target frame, then the context frames (-1, +1). Never augmented. Without
+    context frames, F = 0, there is truth."""
     masks: Tensor
     """[B, N, 1, H, W] in [0, 1], 1 = not the vehicle itself; may be soft."""
     intrinsics: Tensor
@@ -46,11 +47,14 @@ class RigBatch:
     recorded_poses: Tensor | None = None
     """[B, 1 + F, N, 4, 4] each camera's recorded pose at each of its exposures, target first, all in one frame, and
     `base_T_camera` that of the target; None where the losses take the pose network's motion."""
+    truth: Tensor | None = None
+    """[B, N, 1, H, W] metres along the optical axis; inf in the sky, NaN where it is not known."""
 
     def __post_init__(self) -> None:
         _check_shapes(self)
         _check_images(self)
         _check_calibration(self)
+        _check_truth(self)
         _check_neighbours(self)
         _check_exposures(self)
         _check_recorded_poses(self)
@@ -171,6 +175,19 @@ def _check_calibration(batch: RigBatch) -> None:
                 raise RigError(f"base_T_camera of {error}") from error
 
 
+def _check_truth(batch: RigBatch) -> None:
+    if batch.truth is None:
+        if batch.contexts.shape[1] == 0:
+            raise ImageError("a batch without context frames needs truth to learn from, found none")
+        return
+    if batch.truth.shape != batch.masks.shape:
+        raise ImageError(f"truth: shape is {list(batch.truth.shape)}, expected {list(batch.masks.shape)}")
+    wrong = (batch.truth <= 0).flatten(2).any(dim=-1)
+    for sample, camera in wrong.nonzero().tolist():
+        least = float(batch.truth[sample, camera].nan_to_num(nan=1.0).min())
+        raise ImageError(f"sample {sample}, camera {batch.camera_names[camera]}: truth of {least} m, expected above 0")
+
+
 def _check_neighbours(batch: RigBatch) -> None:
     names, cameras = batch.camera_names, batch.cameras
     if batch.targets.shape != batch.sources.shape or batch.targets.ndim != 1:
@@ -184,6 +201,8 @@ def _check_neighbours(batch: RigBatch) -> None:
             )
     if len(set(pairs)) != len(pairs):
         raise RigError(f"neighbour pairs {pairs}: a pair occurs twice")
+    if batch.contexts.shape[1] == 0:
+        return  # learns from truth alone
     lonely = [names[camera] for camera in range(cameras) if camera not in {target for target, _ in pairs}]
     if lonely and batch.recorded_poses is None:
         raise RigError(f"camera {', '.join(lonely)}: no neighbour, so no overlap to learn its scale from")

@@ -89,6 +89,21 @@ class RecordingsConfig(_Section):
         return {True: "auto", False: "none"}[value] if isinstance(value, bool) else value
 
 
+class WorldsConfig(_Section):
+    """How views of rendered worlds become samples; calibration and truth follow every change of the picture."""
+
+    zoom: float = Field(default=1.5, ge=1, le=4)
+    """A random window of the picture, as wide as the picture or down to one of this many parts of it."""
+    squeeze: float = Field(default=0.07, ge=0, le=0.5)
+    """Standard deviation of the logarithm of the pixels' width over their height."""
+    angle_error: float = Field(default=0.5, ge=0, le=10)
+    """Degrees, standard deviation of pitch and roll that the network is told wrongly."""
+    height_error: float = Field(default=0.04, ge=0, le=0.5)
+    """Share of the camera's height, standard deviation, by which the network is told it wrongly."""
+    held_out: float = Field(default=0.03, ge=0, lt=1)
+    """The last share of the drives, which is scored and never trained on."""
+
+
 class OptimizerConfig(_Section):
     """Adam, its learning-rate schedule, and limits on a step."""
 
@@ -102,6 +117,12 @@ class OptimizerConfig(_Section):
     """Epochs after each of which the learning rate is multiplied by `decay_factor`."""
     decay_factor: float = Field(default=0.1, gt=0, le=1)
     """See `decay_after_epochs`."""
+    schedule: Literal["steps", "cosine"] = "steps"
+    """`steps` is that of the two fields before; `cosine` goes from `learning_rate` to a hundredth of it in a run."""
+    warm_up: int = Field(default=0, ge=0)
+    """Steps in which the learning rate rises from nothing."""
+    encoder_rate: float = Field(default=1.0, gt=0, le=1)
+    """Share of the learning rate that the encoders have: less for what begins with ImageNet's weights."""
     weight_decay: float = Field(default=0.0, ge=0)
     """Decoupled (AdamW); 0 is the published Adam."""
     samples_per_step: int = Field(default=4, ge=1)
@@ -142,8 +163,8 @@ class EvaluationConfig(_Section):
 class TrainingConfig(_Section):
     """Everything that determines a training run."""
 
-    dataset: Literal["ddad", "nuscenes", "recording"] = "ddad"
-    """Where samples come from; of the data sets there is no reader yet."""
+    dataset: Literal["ddad", "nuscenes", "recording", "worlds"] = "ddad"
+    """Where samples come from: recordings, or shards of `simulate`; of the data sets there is no reader yet."""
     depth: DepthModelSpec
     """The depth network; checkpoints carry this."""
     pose: PoseConfig = PoseConfig()
@@ -154,6 +175,8 @@ class TrainingConfig(_Section):
     """Changes to the images that the networks see; the losses compare the unchanged ones."""
     recordings: RecordingsConfig = RecordingsConfig()
     """For `dataset: recording`: which moments become samples, and how they are read."""
+    worlds: WorldsConfig = WorldsConfig()
+    """For pre-training on rendered worlds: how their views become samples."""
     optimizer: OptimizerConfig = OptimizerConfig()
     """Adam, its learning-rate schedule, and limits on a step."""
     evaluation: EvaluationConfig = EvaluationConfig()

@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from cvcdepth_core.networks import DepthNetwork, PoseNet, RigImages, disparity_to_depth
+from cvcdepth_core.networks import DepthNetwork, DepthOutputs, PoseNet, RigImages, disparity_to_depth
 from cvcdepth_core.networks.mirroring import LATERAL_AXIS, mirror, mirror_motion, mirror_rig
 from cvcdepth_core.training.batch import RigBatch
 from cvcdepth_core.training.motion import distribute_anchor_motion, distribute_vehicle_motion, motion_to_context
@@ -54,20 +54,24 @@ class SurroundModel(nn.Module):
         """Return disparity, depth and motions for `batch`.
 
         `network_frames` [B, 3, N, 3, H, W] are the batch's frames (0, -1, +1) as the networks shall see them, jittered
-        in training. The samples named by `depth_flips` and `pose_flips` (bool [B]) are shown mirrored to that network
-        and the answer is mirrored back (Hflip-S). Under autocast only the networks run in half precision.
+        in training; of a batch without context frames there is one. The samples named by `depth_flips` and `pose_flips`
+        (bool [B]) are shown mirrored to that network and the answer is mirrored back (Hflip-S). Under autocast only the
+        networks run in half precision.
         """
-        disparity = self._disparity(rig_images(batch, network_frames[:, 0]), depth_flips)
-        vectors = self._motion_vectors(batch, mirror(network_frames, pose_flips))
+        outputs = self._outputs(rig_images(batch, network_frames[:, 0]), depth_flips)
+        vectors = self._motion_vectors(batch, mirror(network_frames, pose_flips)) if len(batch.contexts[0]) else []
         with torch.autocast(network_frames.device.type, enabled=False):
             depth = disparity_to_depth(
-                disparity, batch.intrinsics[..., 0, 0], self.min_depth, self.max_depth, self.focal_scale
+                outputs.disparity, batch.intrinsics[..., 0, 0], self.min_depth, self.max_depth, self.focal_scale
             )
-            return Prediction(disparity, depth, self._motions(batch, vectors, pose_flips))
+            motions = depth.new_zeros(len(depth), 0, batch.cameras, 4, 4)
+            if vectors:
+                motions = self._motions(batch, vectors, pose_flips)
+            return Prediction(outputs.disparity, depth, motions, outputs.sky, outputs.log_uncertainty)
 
-    def _disparity(self, rig: RigImages, flips: Tensor) -> Tensor:
-        disparity: Tensor = self.depth_net(mirror_rig(rig, flips))
-        return mirror(disparity.to(rig.images.dtype), flips)
+    def _outputs(self, rig: RigImages, flips: Tensor) -> DepthOutputs:
+        outputs = self.depth_net.details(mirror_rig(rig, flips))
+        return outputs.map(lambda part: mirror(part.to(rig.images.dtype), flips))
 
     def _motion_vectors(self, batch: RigBatch, frames: Tensor) -> list[MotionVector]:
         """Return what the pose network says for the frames -1 and +1: per sample [B, 3], or per camera [B*N, 3]."""

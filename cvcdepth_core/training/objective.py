@@ -29,6 +29,7 @@ from cvcdepth_core.rendering.view_synthesis import (
 from cvcdepth_core.training.batch import RigBatch
 from cvcdepth_core.training.losses import auto_mask, motion_error, pose_consistency, smoothness
 from cvcdepth_core.training.motion import motions_seen_from_anchor, relative_poses
+from cvcdepth_core.training.truth_losses import LogErrors, sky_error
 
 _IDENTITY_NOISE = 1e-5
 _OVER_VIEW = (-3, -2, -1)
@@ -54,6 +55,16 @@ class ObjectiveConfig(BaseModel):
     recorded_motion: float = Field(default=1.0, ge=0)
     """Weight of the pose network's difference to the recorded motion, see `losses.motion_error`; there is no such term
     where none is recorded, or `recordings.motion` does not take it."""
+    truth: float = Field(default=1.0, ge=0)
+    """Where depth is known (batches with truth): weight of the error of log depth; 0 leaves out all terms of truth."""
+    truth_shape: float = Field(default=0.3, ge=0)
+    """Weight of the deviation of that error over the picture, which no scale changes."""
+    truth_outlines: float = Field(default=0.35, ge=0)
+    """Weight of the error of the steps from pixel to pixel, near and far."""
+    truth_sky: float = Field(default=0.15, ge=0)
+    """Weight of the sky: that depth is far there, and that the network says so if it can."""
+    truth_uncertainty: float = Field(default=0.05, ge=0)
+    """Weight of how well the network foretells its own error, if it does."""
     depth_warping: Literal["ddcl", "dcl"] = "ddcl"
     """How the neighbour's depth comes to the camera: dense backward warping (DDCL) or sparse splatting (DCL)."""
     corrected: bool = False
@@ -71,6 +82,10 @@ class Prediction:
     """[B, N, 1, H, W] metres."""
     motions: Tensor
     """[B, F, N, 4, 4] pose `context_T_target` of each camera for each context frame."""
+    sky: Tensor | None = None
+    """[B, N, 1, H, W] logit of the sky, of networks that tell it."""
+    log_uncertainty: Tensor | None = None
+    """[B, N, 1, H, W] logarithm of the expected error of log depth, of networks that tell it."""
 
     def first_sample(self) -> Prediction:
         """Return the output for the first sample, without its gradient."""
@@ -173,22 +188,44 @@ def evaluate_objective(
     precision of its inputs, outside autocast: projections need more than half precision.
     """
     with torch.autocast(batch.frames.device.type, enabled=False):
-        batch = batch.at_exposures(prediction.motions[:, :, batch.anchor])
-        if config.corrected:
-            batch = _with_binary_masks(batch)
-        views = synthesise_views(batch, prediction, config)
-        errors = _masked_errors(batch, prediction, views, config, identity_noise)
-        terms = {name: weighted_mean(*_added_up(part.sums() for part in parts)) for name, parts in errors.items()}
-        if "reconstruction_consistency" in terms:
-            terms["reconstruction_consistency"] = terms["reconstruction_consistency"].mean(dim=1)
-        if config.smoothness > 0:
-            terms["smoothness"] = smoothness(prediction.disparity, batch.images)
-        if config.pose_consistency > 0:
-            seen = motions_seen_from_anchor(prediction.motions, batch.base_T_camera, batch.anchor)
-            terms["pose_consistency"] = pose_consistency(seen, batch.anchor)
-        if batch.recorded_motions is not None and config.recorded_motion > 0:
-            terms["recorded_motion"] = motion_error(prediction.motions, batch.recorded_motions).mean(dim=1)
+        terms = _self_supervised_terms(batch, prediction, config, identity_noise) if len(batch.contexts[0]) else {}
+        if batch.truth is not None and config.truth > 0:
+            terms |= _truth_terms(batch.truth, prediction)
         return ObjectiveValue(per_sample=_weighted_total(terms, config).mean(dim=1), terms=terms)
+
+
+def _self_supervised_terms(
+    batch: RigBatch, prediction: Prediction, config: ObjectiveConfig, identity_noise: Tensor | None
+) -> dict[str, Tensor]:
+    batch = batch.at_exposures(prediction.motions[:, :, batch.anchor])
+    if config.corrected:
+        batch = _with_binary_masks(batch)
+    views = synthesise_views(batch, prediction, config)
+    errors = _masked_errors(batch, prediction, views, config, identity_noise)
+    terms = {name: weighted_mean(*_added_up(part.sums() for part in parts)) for name, parts in errors.items()}
+    if "reconstruction_consistency" in terms:
+        terms["reconstruction_consistency"] = terms["reconstruction_consistency"].mean(dim=1)
+    if config.smoothness > 0:
+        terms["smoothness"] = smoothness(prediction.disparity, batch.images)
+    if config.pose_consistency > 0:
+        seen = motions_seen_from_anchor(prediction.motions, batch.base_T_camera, batch.anchor)
+        terms["pose_consistency"] = pose_consistency(seen, batch.anchor)
+    if batch.recorded_motions is not None and config.recorded_motion > 0:
+        terms["recorded_motion"] = motion_error(prediction.motions, batch.recorded_motions).mean(dim=1)
+    return terms
+
+
+def _truth_terms(truth: Tensor, prediction: Prediction) -> dict[str, Tensor]:
+    errors = LogErrors.of(prediction.depth, truth)
+    terms = {
+        "truth": errors.mean(),
+        "truth_shape": errors.deviation(),
+        "truth_outlines": errors.of_steps(),
+        "truth_sky": sky_error(prediction.depth, prediction.sky, truth),
+    }
+    if prediction.log_uncertainty is not None:
+        terms["truth_uncertainty"] = errors.surprise(prediction.log_uncertainty)
+    return terms
 
 
 def _weighted_total(terms: Mapping[str, Tensor], config: ObjectiveConfig) -> Tensor:

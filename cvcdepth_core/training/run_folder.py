@@ -153,9 +153,10 @@ def _configuration(path: Path, state: Mapping[str, Any]) -> TrainingConfig:
 
 def _what_is_computed(config: TrainingConfig) -> dict[str, Any]:
     """Return the fields that determine the weights after a step, without the number of steps and the reporting."""
+    steps_follow_epochs = config.optimizer.schedule == "cosine"
     return config.model_dump(
         exclude={
-            "optimizer": {"epochs", "samples_per_batch"},
+            "optimizer": {"samples_per_batch"} if steps_follow_epochs else {"epochs", "samples_per_batch"},
             "recordings": {"workers", "cache_mb"},
             "checkpoint_every": True,
             "pictures_every": True,

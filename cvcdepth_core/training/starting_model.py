@@ -12,6 +12,7 @@ from cvcdepth_core.errors import CheckpointError, ConfigError
 from cvcdepth_core.networks import DepthNet, PoseNet, build_depth_network
 from cvcdepth_core.networks.checkpoint import Checkpoint, load_imagenet_encoder, load_network_state
 from cvcdepth_core.networks.registry import DepthModelSpec
+from cvcdepth_core.networks.rig_conditioned import RigConditionedNet
 from cvcdepth_core.networks.rig_images import DepthNetwork
 from cvcdepth_core.training.config import TrainingConfig
 from cvcdepth_core.training.model import SurroundModel
@@ -37,10 +38,10 @@ def build_surround_model(config: TrainingConfig, start: Checkpoint | None = None
 def build_imagenet_model(config: TrainingConfig, classifier: Path, initial_depth: float) -> SurroundModel:
     """Return both networks of `config` with encoders from an ImageNet classifier's file, all else random by its seed.
 
-    The depth network begins with a constant depth of `initial_depth` metres for a camera with fx = focal_scale: from
-    the sigmoid's middle, which is nearer than a metre, the first warps miss their images (on the sample: Abs Rel 0.90
-    after 130 steps, against 0.49 from 8 m). Raises ConfigError where that is outside of the depth range or the encoders
-    differ, CheckpointError, naming the file, where it does not fit them.
+    The published depth network begins with a constant depth of `initial_depth` metres for a camera with fx =
+    focal_scale: from the sigmoid's middle, which is nearer than a metre, the first warps miss their images (on the
+    sample: Abs Rel 0.90 after 130 steps, against 0.49 from 8 m). Raises ConfigError where that is outside of the depth
+    range or the encoders differ, CheckpointError, naming the file, where it does not fit them.
     """
     if config.pose.encoder != config.depth.encoder:
         raise ConfigError(
@@ -49,10 +50,13 @@ def build_imagenet_model(config: TrainingConfig, classifier: Path, initial_depth
         )
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
-        depth_net, pose_net = DepthNet(config.depth.encoder), PoseNet(config.pose.encoder)
+        depth_net, pose_net = build_depth_network(config.depth), PoseNet(config.pose.encoder)
+    if not isinstance(depth_net, (DepthNet, RigConditionedNet)):
+        raise ConfigError(f"depth.network is {config.depth.network}, which has no encoder that ImageNet could start")
     for encoder in (depth_net.depth_encoder, pose_net.pose_encoder):
         load_imagenet_encoder(encoder, classifier)
-    _start_at_depth(depth_net, config.depth, initial_depth)
+    if isinstance(depth_net, DepthNet):
+        _start_at_depth(depth_net, config.depth, initial_depth)
     return _surround_model(config, depth_net, pose_net)
 
 
@@ -90,5 +94,6 @@ def _refuse_other_meaning(start: Checkpoint, config: TrainingConfig) -> None:
         if found != want:
             at = f" at a width of {config.depth.width}" if name == "focal_scale" else ""
             raise CheckpointError(
-                f"{start.path}: {name} is {found}{at}, but the configuration's depth.{name} is {want}"
+                f"{start.path}: {name} is {found}{at}, but the configuration's depth.{name} is {want}; "
+                "who starts from weights keeps that value"
             )

@@ -30,13 +30,14 @@ from cvcdepth_core.networks.checkpoint import save_checkpoint
 from cvcdepth_core.processor import BFLOAT16, multiplies_bfloat16
 from cvcdepth_core.training.augmentation import draw_flips, jitter_colors
 from cvcdepth_core.training.batch import RigBatch
-from cvcdepth_core.training.config import AugmentationConfig, TrainingConfig
+from cvcdepth_core.training.config import AugmentationConfig, OptimizerConfig, TrainingConfig
 from cvcdepth_core.training.distributed import SINGLE_PROCESS, Processes, share_batch_statistics
 from cvcdepth_core.training.model import SurroundModel
 from cvcdepth_core.training.objective import ObjectiveValue, Prediction, evaluate_objective
 from cvcdepth_core.training.run_folder import RunFolder, RunIdentity
 
 _MAX_SKIPPED_IN_A_ROW = 20
+_LEAST_OF_COSINE = 0.01
 
 
 @dataclass(frozen=True)
@@ -139,7 +140,7 @@ class Trainer:
         )
         self._folder = RunFolder(run_directory)
         self._optimizer = torch.optim.AdamW(
-            self.model.parameters(),
+            _parameter_groups(self.model, config.optimizer),
             lr=config.optimizer.learning_rate,
             betas=config.optimizer.betas,
             fused=True,
@@ -239,9 +240,6 @@ class Trainer:
 
     def _train_epoch(self, bar: tqdm[Any]) -> None:
         optimizer = self.config.optimizer
-        decays = self.progress.epoch // optimizer.decay_after_epochs
-        for group in self._optimizer.param_groups:
-            group["lr"] = optimizer.learning_rate * optimizer.decay_factor**decays
         batches = self._batches.epoch(self.progress.epoch, self.progress.batch)
         length = optimizer.samples_per_step // self._samples_together
         self.model.train()
@@ -249,6 +247,7 @@ class Trainer:
             began = time.perf_counter()
             if not (batches_of_step := list(islice(batches, length))):
                 break
+            self._set_learning_rates()
             entry = {"seconds_waiting": round(time.perf_counter() - began, 4), **self._step(batches_of_step)}
             entry["seconds"] = round(time.perf_counter() - began, 4)
             self.progress.batch += len(batches_of_step)
@@ -261,6 +260,17 @@ class Trainer:
                 self.save()
         self.progress.epoch += 1
         self.progress.batch = 0
+
+    def _set_learning_rates(self) -> None:
+        optimizer = self.config.optimizer
+        rate = optimizer.learning_rate * min(1.0, (self.progress.step + 1) / max(1, optimizer.warm_up))
+        if optimizer.schedule == "cosine":
+            done = self._samples_done / (optimizer.epochs * self._batches.samples)
+            rate *= max(_LEAST_OF_COSINE, 0.5 + 0.5 * math.cos(math.pi * done))
+        else:
+            rate *= optimizer.decay_factor ** (self.progress.epoch // optimizer.decay_after_epochs)
+        for group, share in zip(self._optimizer.param_groups, (1.0, optimizer.encoder_rate), strict=False):
+            group["lr"] = rate * share
 
     def _step(self, batches: Sequence[RigBatch | None]) -> dict[str, Any]:
         """Make one optimiser step of several batches; return its log entry."""
@@ -328,8 +338,8 @@ class Trainer:
         """Turn the gradients' sum into the mean of all processes and shorten it if configured; return its length."""
         self._processes.sum_gradients_over_processes(list(self.model.parameters()))
         for parameter in self.model.parameters():
-            if parameter.grad is not None:
-                parameter.grad /= max(samples, 1)
+            if parameter.grad is not None and samples > 1:
+                parameter.grad /= samples
         limit = self.config.optimizer.max_gradient_norm or math.inf
         return float(nn.utils.clip_grad_norm_(self.model.parameters(), limit))
 
@@ -378,6 +388,16 @@ def _prepared(model: SurroundModel, device: torch.device, processes: Processes) 
     # On CPUs, channels-last makes a step of the networks a fifth to a third shorter.
     model = model.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return model if processes.count == 1 else cast(SurroundModel, share_batch_statistics(model, device))
+
+
+def _parameter_groups(model: SurroundModel, config: OptimizerConfig) -> list[dict[str, Any]]:
+    """Return all parameters as one group; or the encoders', which learn at another rate, as a second one."""
+    if config.encoder_rate == 1.0:
+        return [{"params": list(model.parameters())}]
+    groups: tuple[list[nn.Parameter], list[nn.Parameter]] = ([], [])
+    for name, parameter in model.named_parameters():
+        groups["_encoder." in name].append(parameter)
+    return [{"params": group} for group in groups]
 
 
 def _refuse_uneven_shares(config: TrainingConfig, processes: Processes) -> None:

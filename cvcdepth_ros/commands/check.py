@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 
 SUMMARY = """Check whether recordings and a rig will work, with a remedy for what will not.
 
-Fourteen numbered checks: cameras, calibrations, transforms, stamps, sets, overlaps, masks, LiDAR, motion, encodings,
-brightness, whether two cameras were swapped, what `finetune` would learn from, and a checkpoint's pose network. The
-exit code is 1 when a check failed; warnings leave it at 0."""
+Fifteen numbered checks: cameras, calibrations, transforms, stamps, sets, overlaps, masks, LiDAR, motion, encodings,
+brightness, whether two cameras were swapped, what `finetune` would learn from, a checkpoint's pose network, and how
+much of its lens each camera shows. The exit code is 1 when a check failed; warnings leave it at 0."""
 EXAMPLES: tuple[str, ...] = (
     "check drive.mcap",
     "check drives/ --rig rig.yaml --tolerance 0.05 --lidar /lidar/points --json",

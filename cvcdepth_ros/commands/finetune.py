@@ -100,9 +100,10 @@ def _training_config(path: Path) -> "TrainingConfig":
 
     config = load_training_config(path)
     if config.dataset != "recording":
+        why = "for `cvcdepth pretrain`" if config.dataset == "worlds" else "for which there is no reader yet"
         raise ConfigError(
-            f"{path}: dataset is {config.dataset!r}, for which there is no reader yet; to train on recordings, write "
-            f"`dataset: recording` in this file, or in a new one below `base: {path.resolve()}`"
+            f"{path}: dataset is {config.dataset!r}, {why}; to train on recordings, write `dataset: recording` in this "
+            f"file, or in a new one below `base: {path.resolve()}`"
         )
     return config
 

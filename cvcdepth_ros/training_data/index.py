@@ -178,7 +178,11 @@ def _unread(replay: SurroundReplay, refused: Refusals, sets: int) -> Iterator[st
 
 def _refuse_lonely_cameras(recorded: RecordedRig) -> None:
     neighbours = recorded.layout.complete().neighbours
-    lonely = [name for name, others in neighbours.items() if not others]
+    lonely = [
+        " and ".join(views)
+        for views in recorded.layout.views_by_image.values()
+        if all(other in views for name in views for other in neighbours[name])
+    ]
     if lonely:
         raise RigError(
             f"{recorded.recording.path}: camera {', '.join(lonely)}: shares no view with another camera, so there is "

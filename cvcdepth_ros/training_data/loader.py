@@ -13,7 +13,9 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader
 
-from cvcdepth_core.errors import RecordingError
+from cvcdepth_core.errors import RecordingError, RigError
+from cvcdepth_core.networks.registry import RIG_CONDITIONED
+from cvcdepth_core.rig.ground import refuse_unlikely_ground
 from cvcdepth_core.training.batch import RigBatch
 from cvcdepth_core.training.config import RecordingsConfig, TrainingConfig
 from cvcdepth_core.training.distributed import SINGLE_PROCESS, Processes
@@ -54,8 +56,13 @@ class RecordingBatches:
     def __init__(
         self, indexes: Sequence[RecordingIndex], config: TrainingConfig, processes: Processes = SINGLE_PROCESS
     ) -> None:
-        """Find the samples; RecordingError names recording and values when there are none."""
+        """Find the samples; RecordingError names recording and values when there are none.
+
+        RigError names recording and camera where the network is told a rig that cannot be right about the ground.
+        """
         _refuse_unrecorded_motion(indexes, config.recordings)
+        if config.depth.network == RIG_CONDITIONED:
+            _refuse_unlikely_ground(indexes)
         refuse_standstill(indexes, config.recordings)
         variants = [
             sample_variants(index, config.recordings, sample)
@@ -115,6 +122,14 @@ def _refuse_unrecorded_motion(indexes: Sequence[RecordingIndex], config: Recordi
                 f"{', '.join(without)}: no motion is recorded, but recordings.{name} is 'recorded'; 'auto' takes "
                 "the pose network's there"
             )
+
+
+def _refuse_unlikely_ground(indexes: Sequence[RecordingIndex]) -> None:
+    for index in indexes:
+        try:
+            refuse_unlikely_ground(index.layout.complete())
+        except RigError as error:
+            raise RigError(f"{index.path}: {error}") from error
 
 
 def _at_least(samples: list[int], count: int) -> list[int]:

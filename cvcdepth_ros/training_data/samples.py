@@ -24,8 +24,9 @@ from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_core.training.batch import RigBatch
 from cvcdepth_core.training.config import RecordingsConfig
 from cvcdepth_ros.bags import Recording, open_recording
-from cvcdepth_ros.messages.conversion import picture_from_message, stamp_ns
+from cvcdepth_ros.messages.conversion import stamp_ns
 from cvcdepth_ros.recently_used import RecentlyUsed
+from cvcdepth_ros.surround_sets.set_estimation import images_of
 from cvcdepth_ros.training_data.index import RecordingIndex
 from cvcdepth_ros.training_data.sample_choice import Sample, takes_recorded_exposures, takes_recorded_motion
 
@@ -38,7 +39,8 @@ class NetworkRig:
     names: tuple[str, ...]
     anchor: int
     base_T_camera: NDArray[np.float64]
-    """[N, 4, 4] without the vehicle's motion."""
+    """[N, 4, 4] without the vehicle's motion; z = 0 is the base frame's, `ground_height` above it the ground."""
+    ground_height: float
     pairs: tuple[tuple[int, int], ...]
     """(camera, neighbour)."""
 
@@ -51,6 +53,7 @@ class NetworkRig:
             tuple(rig.names),
             index.anchor,
             np.stack([camera.base_T_camera for camera in rig.cameras]),
+            rig.ground_height,
             tuple(rig.neighbour_indices),
         )
 
@@ -65,11 +68,13 @@ class NetworkRig:
         """Join what samples have of their own with the rig's constants.
 
         That is pictures (uint8 [B, 3, N, H, W, 3], target first), poses [B, N, 4, 4], times and recorded poses of
-        `ReadSample`.
+        `ReadSample`. The batch's poses have the ground at z = 0.
         """
         samples = len(frames)
         masks = torch.from_numpy(self.preprocessor.valid).float()[:, None]
         intrinsics = torch.from_numpy(self.preprocessor.intrinsics).float()
+        base_T_camera = base_T_camera.clone()
+        base_T_camera[..., 2, 3] -= self.ground_height
         return RigBatch(
             frames=frames.permute(0, 1, 2, 5, 3, 4).contiguous().float() / 255,
             masks=masks.expand(samples, *masks.shape),
@@ -184,23 +189,27 @@ class SampleReader(Dataset[ReadSample | None]):
     def _rectified(self, recording: int, row: int) -> Iterator[Picture]:
         messages = self._messages(recording, row)
         rig = self.rigs[recording]
-        for camera, (name, message) in enumerate(zip(rig.names, messages, strict=True)):
+        for name, message in zip(rig.names, messages, strict=True):
             if message is None:
                 raise ImageError(f"camera {name}: the image of set {row} is not found again in the recording")
-            reduction = rig.preprocessor.rectifiers[name].reduction
-            yield rig.preprocessor.rectify(camera, picture_from_message(message, name, reduction), reduction)
+        images = images_of(dict(zip(rig.names, messages, strict=True)))
+        for camera, name in enumerate(rig.names):
+            rectifier = rig.preprocessor.rectifiers[name]
+            yield rig.preprocessor.rectify(camera, images[name].decoded(name, rectifier), rectifier.reduction)
 
     def _messages(self, recording: int, row: int) -> list[Any]:
         """Return each camera's message of a set, None where the recording has it no more."""
         index, opened = self._indexes[recording], self._open(recording)
         log_times = index.log_times[row].tolist()
         topics = [camera.image_topic for camera in index.layout.cameras]
-        wanted = {(topic, time): camera for camera, (topic, time) in enumerate(zip(topics, log_times, strict=True))}
+        wanted: dict[tuple[str, int], list[int]] = {}
+        for camera, place in enumerate(zip(topics, log_times, strict=True)):
+            wanted.setdefault(place, []).append(camera)
         found: list[Any] = [None] * len(topics)
         for message in opened.messages(set(topics), min(log_times), max(log_times) + 1):
-            camera = wanted.get((message.topic, message.log_time))
-            if camera is not None:
-                content = opened.deserialize(message)
+            cameras = wanted.get((message.topic, message.log_time), ())
+            content = opened.deserialize(message) if cameras else None
+            for camera in cameras:
                 if stamp_ns(content) == index.stamps[row, camera]:
                     found[camera] = content
         return found

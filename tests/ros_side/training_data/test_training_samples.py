@@ -416,3 +416,29 @@ def test_motion_that_reaches_no_set_is_refused_by_the_recordings_name(tmp_path):
 def test_a_recording_that_lost_its_messages_since_gives_no_batch(index, tmp_path):
     shorter = replace(index, path=write_rosbag2(tmp_path / "shorter", sample_entries(1)))
     assert list(RecordingBatches([shorter], config()).epoch(0)) == [None] * 8
+
+
+def on_ground(index, height):
+    return replace(index, layout=index.layout.model_copy(update={"ground_height": height}))
+
+
+def test_poses_are_those_above_the_ground_of_the_rig_file(index):
+    plain, lowered = (next(RecordingBatches([on_ground(index, h)], config()).epoch(0)) for h in (0.0, -0.4))
+    above = plain.base_T_camera.clone()
+    above[..., 2, 3] += 0.4
+    torch.testing.assert_close(lowered.base_T_camera, above)
+
+
+def test_a_ground_that_cannot_be_is_refused_where_the_network_is_told_it(index):
+    spec = DepthModelSpec(
+        network="rig_conditioned",
+        encoder="efficientnet_lite0",
+        height=HEIGHT,
+        width=WIDTH,
+        min_depth=0.4,
+        max_depth=250,
+    )
+    buried = on_ground(index, 1.7)
+    RecordingBatches([buried], config())
+    with pytest.raises(RigError, match=r"pandaset_002_excerpt: camera front: 0\.11 m above the ground, .* 0\.2 to 6"):
+        RecordingBatches([buried], config().model_copy(update={"depth": spec}))
