@@ -111,7 +111,7 @@ def command(name: str, recording: str, rig: Path | None, *options: str, allowed:
 def row(metrics: Mapping[str, Any]) -> Row:
     """Return the numbers of a metrics.json."""
     image = metrics["scores"]["image"]["metric"]["mean"]
-    pose = metrics.get("pose_network") or {"ratio": float("nan"), "degrees": float("nan")}
+    pose = metrics["pose_network"]
     scale = geometric_mean(metrics["scale_ratio"]["image"].values())
     return Row(image["all"]["abs_rel"], far(image), scale, pose["ratio"], pose["degrees"])
 
