@@ -40,7 +40,7 @@ SMALL = {
     "pose": {"encoder": "efficientnet_lite0"},
     "recordings": {"held_out": 0.6, "min_travel": 0.1},  # six sets: with fewer there is no verdict
     "optimizer": {"epochs": 1, "samples_per_step": 2},
-    "evaluation": {"max_depth": 80},
+    "evaluation": {"max_depth": 80, "sets": 2},
 }
 CHEAP = ("--skip", "places", "--no-masks")  # what other tests are about
 UNPROVEN = (*CHEAP, "--no-promotion")
@@ -103,7 +103,7 @@ def worse(better, tmp_path_factory) -> Run:
     blind = recordings.write_rosbag2(folder / "blind <b>&", recordings.without(recordings.sample_entries(), "/lidar"))
     optimizer = {"epochs": 6, "samples_per_step": 5, "learning_rate": 0.5}
     recorded = SMALL["recordings"] | {"motion": "auto"}
-    evaluation = {"max_depth": 80, "patience": 2}
+    evaluation = SMALL["evaluation"] | {"patience": 2}
     path = write_config(folder / "finetune.yaml", optimizer=optimizer, evaluation=evaluation, recordings=recorded)
     start = better.folder / "best.safetensors"
     code = finetune(path, folder / "run", "--from", start, *CHEAP, bags=(blind,))
