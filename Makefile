@@ -11,7 +11,7 @@ key = $(shell { echo "$(TORCH)"; cat requirements/$(1).lock setup.py; } | sha256
 DEMO := .venv/installed/demo-$(call key,demo)
 DEV := .venv/installed/dev-$(call key,dev)
 CORE := .venv-core/installed/core_test-$(call key,core_test)
-TF2 := .venv/installed/tf2_msgs-$(shell cat tests/support/tf2_msgs/*.* tests/support/tf2_msgs/msg/* | sha256sum | cut -c1-12)
+MESSAGES := .venv/installed/messages-$(shell find tests/support/message_packages -type f -not -name '*.pyc' | LC_ALL=C sort | xargs cat | sha256sum | cut -c1-12)
 
 # Two tests at a time. A file's tests mostly stay in one process, which has the results that they share.
 BESIDE := -n 2 --dist worksteal
@@ -28,7 +28,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo bench test lint test-ros test-core test-faults fuzz soak tf2_msgs lock clean
+.PHONY: help demo bench test lint test-ros test-core test-faults fuzz soak messages lock clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z0-9_-]*\):.* ## /\1\t/p' Makefile | expand -t 12
@@ -54,7 +54,7 @@ lint: $(DEV) ## ruff and mypy
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
 
-test-ros: $(DEV) tf2_msgs ## the tests in tests/with_ros, with ROS 2 from wheels
+test-ros: $(DEV) messages ## the tests in tests/with_ros, with ROS 2 from wheels
 	.venv/bin/python -m pytest $(BESIDE) tests/with_ros
 
 test-core: $(CORE) ## all other tests, in an environment without ROS
@@ -73,8 +73,8 @@ fuzz: $(DEV) ## fuzz everything that reads foreign bytes (SECONDS=60 for each ta
 soak: $(DEV) ## feed the node with faults for MINUTES=60 and watch memory, files and threads
 	.venv/bin/python tools/soak.py --minutes $(or $(MINUTES),60) --output output/soak.json
 
-tf2_msgs: $(DEV) ## build tf2_msgs, which has no wheel, for the tests of /tf_static (needs g++)
-	@test -e $(TF2) || .venv/bin/python tests/support/tf2_msgs/build.py $(TF2)
+messages: $(DEV) ## build message packages without wheels, for tests of /tf_static and video (needs g++)
+	@test -e $(MESSAGES) || .venv/bin/python tests/support/message_packages/build.py $(MESSAGES)
 
 lock: .venv-lock/bin/uv ## resolve requirements/*.in again (LOCK=--upgrade for newer versions)
 	$(call compile,dev) $(LOCK)

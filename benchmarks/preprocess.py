@@ -26,7 +26,7 @@ from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.messages.conversion import picture_from_message
 from cvcdepth_ros.recordings.rig import discover_rig
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
-from cvcdepth_ros.surround_sets.set_estimation import picture_or_error
+from cvcdepth_ros.surround_sets.set_estimation import EncodedImage, picture_or_error
 
 SAMPLE = Path(__file__).parent.parent / "samples" / "pandaset_002_excerpt"
 
@@ -71,7 +71,10 @@ def cases(messages: Sequence[Any], rig: Rig, height: int, width: int) -> dict[st
 
 def pictures_of(messages: Sequence[Any], rectifiers: Sequence[Rectifier]) -> list[Picture]:
     """Do what node, bag tool and trainer do."""
-    outcomes = [picture_or_error(m, "camera", r, StageLatencies()) for m, r in zip(messages, rectifiers, strict=True)]
+    outcomes = [
+        picture_or_error(EncodedImage(m), "camera", r, StageLatencies())
+        for m, r in zip(messages, rectifiers, strict=True)
+    ]
     return [outcome for outcome in outcomes if not isinstance(outcome, Exception)]
 
 

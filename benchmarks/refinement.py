@@ -25,6 +25,7 @@ from cvcdepth_core.refinement.moments import SurroundMoment
 from cvcdepth_core.refinement.refiner import SurroundRefiner
 from cvcdepth_core.refinement.settings import RefinementSettings
 from cvcdepth_core.rig.rig import Rig
+from cvcdepth_core.surround_depth import SurroundPictures
 from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings
 from cvcdepth_ros.evaluation.measuring import MeasuredSet, open_evaluation
 from cvcdepth_ros.process_setup import prepare_process
@@ -54,7 +55,7 @@ def main() -> None:
 
 def taken(measured: MeasuredSet) -> SurroundMoment:
     """Put a measured set together."""
-    rig, images, depth = measured.estimated.rig, measured.estimated.images, measured.estimated.depth
+    rig, images, depth = measured.estimated.rig, measured.estimated.surround_set, measured.estimated.result
     return SurroundMoment(
         depth=depth.depth,
         pictures=depth.pictures,
@@ -69,9 +70,8 @@ def taken(measured: MeasuredSet) -> SurroundMoment:
 
 def cases(rig: Rig, moments: list[SurroundMoment], estimator: DepthEstimator) -> dict[str, Callable[[], object]]:
     last = moments[-1]
-    found: dict[str, Callable[[], object]] = {
-        "inference": lambda: estimator.estimate(list(last.pictures), last.intrinsics[:, 0, 0])
-    }
+    surround = SurroundPictures(last.pictures, last.present, last.intrinsics, last.base_T_camera, last.valid)
+    found: dict[str, Callable[[], object]] = {"inference": lambda: estimator.estimate(surround)}
     for width in (160, 320):
         found[f"refinement, {width * 3 // 5}x{width}"] = refining(
             rig, moments, RefinementSettings(max_grid_width=width)

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from cvcdepth_core.engines import build_engine
 from cvcdepth_core.images.decoding import Picture
 from cvcdepth_core.images.surround import SurroundPreprocessor
-from cvcdepth_core.model_choices import Precision
+from cvcdepth_core.model_choices import FlipFusion, Precision
 from cvcdepth_core.networks import DepthNetwork, build_depth_network, disparity_to_depth
 from cvcdepth_core.networks.checkpoint import load_checkpoint
+from cvcdepth_core.networks.mirroring import fuse_with_mirrored, mirrored_pictures
 from cvcdepth_core.networks.registry import RIG_CONDITIONED, DepthModelSpec
 from cvcdepth_core.rig.ground import refuse_unlikely_ground
 from cvcdepth_core.rig.rig import Rig
@@ -64,10 +65,15 @@ class DepthEstimator:
         backend: str = "auto",
         precision: Precision = "float32",
         cpu_fallback: bool = False,
+        flip_fusion: FlipFusion = "none",
     ) -> None:
-        """`weights_id` is what reports call the weights; for the rest, and the errors raised, see `build_engine`."""
+        """`weights_id` is what reports call the weights; for the rest, and the errors raised, see `build_engine`.
+
+        With `flip_fusion` the network sees every set twice, the second time mirrored, and both depths are fused.
+        """
         self.spec = spec
         self.weights_id = weights_id
+        self.flip_fusion = flip_fusion
         self._engine = build_engine(network, spec, device, backend, precision, cpu_fallback)
 
     @classmethod
@@ -91,7 +97,8 @@ class DepthEstimator:
     @property
     def model_id(self) -> str:
         """What reports call the weights and what runs them."""
-        return f"{self.weights_id} with {self._engine.name}"
+        fused = "" if self.flip_fusion == "none" else f", flip fusion of {self.flip_fusion.replace('_', ' ')}"
+        return f"{self.weights_id} with {self._engine.name}{fused}"
 
     @property
     def device(self) -> torch.device:
@@ -110,15 +117,21 @@ class DepthEstimator:
         the device fails or has too little memory.
         """
         with torch.inference_mode():
-            depth = disparity_to_depth(
-                self._engine.disparity(surround),
-                torch.as_tensor(surround.fx, dtype=torch.float32),
-                self.spec.min_depth,
-                self.spec.max_depth,
-                self.spec.focal_scale,
-            )
+            depth = self._depth(surround)
+            if self.flip_fusion != "none":
+                depth = fuse_with_mirrored(depth, self._depth(mirrored_pictures(surround)), self.flip_fusion)
         metres: NDArray[np.float32] = depth[:, 0].numpy()
         return metres
+
+    def _depth(self, surround: SurroundPictures) -> torch.Tensor:
+        """Return the network's depth [N, 1, H, W] in metres."""
+        return disparity_to_depth(
+            self._engine.disparity(surround),
+            torch.as_tensor(surround.fx, dtype=torch.float32),
+            self.spec.min_depth,
+            self.spec.max_depth,
+            self.spec.focal_scale,
+        )
 
 
 def untrained_network(spec: DepthModelSpec, seed: int = 0) -> DepthNetwork:

@@ -19,6 +19,9 @@ Precision = Literal["float32", "bfloat16", "float16"]
 """In what an engine computes; depth is float32 always."""
 PRECISIONS: tuple[Precision, ...] = get_args(Precision)
 
+FlipFusion = Literal["none", "depth", "inverse_depth"]
+"""What of the usual and of the mirrored pictures is fused."""
+
 DEFAULT = "default"
 """Name of the small model that comes with the package, in the place of a checkpoint's path."""
 

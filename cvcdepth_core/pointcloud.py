@@ -34,11 +34,16 @@ class CloudLimits:
     """Metres from the camera along its axis; farther points are left out."""
     voxel: float = 0.0
     """Edge in metres of the cubes of which each keeps one point; 0 keeps every point."""
+    min_confidence: float = 0.0
+    """Pixels of less confidence make no points."""
 
 
-def organised_cloud(surround: SurroundDepth, camera: int) -> Cloud:
-    """Return one camera's cloud [H, W, 4] in its optical frame; x, y, z are NaN where depth is (REP 118)."""
-    depth = surround.depth[camera]
+def organised_cloud(surround: SurroundDepth, camera: int, min_confidence: float = 0.0) -> Cloud:
+    """Return one camera's cloud [H, W, 4] in its optical frame.
+
+    x, y, z are NaN where depth is (REP 118), or confidence is below `min_confidence`.
+    """
+    depth = surround.sure_depth(camera, min_confidence)
     cloud = np.empty((*depth.shape, 4), dtype=np.float32)
     view = _View(depth, surround.pictures[camera], np.linalg.inv(surround.intrinsics[camera]), np.zeros(3), stride=1)
     for rows in view.blocks():
@@ -53,7 +58,7 @@ def merged_cloud(surround: SurroundDepth, rig: Rig, limits: CloudLimits) -> Clou
     for camera in np.flatnonzero(surround.present).tolist():
         base_T_camera = rig.cameras[camera].base_T_camera
         rays = base_T_camera[:3, :3] @ np.linalg.inv(surround.intrinsics[camera])
-        depth, picture = surround.depth[camera], surround.pictures[camera]
+        depth, picture = surround.sure_depth(camera, limits.min_confidence), surround.pictures[camera]
         view = _View(depth, picture, rays, base_T_camera[:3, 3], limits.stride)
         for rows in view.blocks():
             end += _append(view, rows, limits, merged[end:])

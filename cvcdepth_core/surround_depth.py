@@ -42,3 +42,14 @@ class SurroundDepth:
     """[N, 3, 3] of those pictures, pixel centres at the integers."""
     present: NDArray[np.bool_]
     """[N] which cameras gave a picture; the others' depth is NaN and their picture black."""
+    confidence: NDArray[np.float32] | None = None
+    """[N, H, W] probability that depth is right within a factor of 1.25, 0 where nothing could be checked; None where
+    it was not asked for."""
+
+    def sure_depth(self, camera: int, least: float) -> NDArray[np.float32]:
+        """Return a camera's depth [H, W], NaN where its confidence is below `least`; all of it where that is 0."""
+        depth: NDArray[np.float32] = self.depth[camera]
+        if least <= 0:
+            return depth
+        sure = np.False_ if self.confidence is None else self.confidence[camera] >= least
+        return np.where(sure, depth, np.float32(np.nan)).astype(np.float32)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from cvcdepth_core.errors import ConfigError, first_validation_message
-from cvcdepth_core.model_choices import DEFAULT, NOTICE, Backend, Precision, checkpoint_path
+from cvcdepth_core.model_choices import DEFAULT, NOTICE, Backend, FlipFusion, Precision, checkpoint_path
 
 if TYPE_CHECKING:
     from cvcdepth_core.estimator import DepthEstimator
@@ -25,7 +25,14 @@ LIDAR_TOLERANCE = 0.1
 AUTO = "auto"
 """Name of the rig that the node finds among the live topics."""
 
-CHANGEABLE_WHILE_RUNNING = ("checkpoint", "cloud_stride", "cloud_min_range", "cloud_max_range", "cloud_voxel")
+CHANGEABLE_WHILE_RUNNING = (
+    "checkpoint",
+    "cloud_stride",
+    "cloud_min_range",
+    "cloud_max_range",
+    "cloud_voxel",
+    "cloud_min_confidence",
+)
 """Parameters of the node that need not wait until it is cleaned up."""
 
 _SMALLEST_VOXEL = 0.01
@@ -62,11 +69,22 @@ class ModelSettings(Settings):
     """In what a CUDA device computes; CPUs know float32 only."""
     cpu_fallback: bool = False
     """Go on with the CPU, more slowly, when the GPU fails, or its memory is too small even for one camera."""
+    refine: Literal["off", "geometry"] = "off"
+    """What is made of the network's depth: off leaves it, geometry compares pictures of neighbours and earlier ones."""
+    refine_width: int = Field(160, ge=32, le=4096)
+    """Refinement and confidence only: columns of the grid that pictures are compared on, at most; more is slower."""
+    flip_fusion: bool = False
+    """Run the network on mirrored pictures too and fuse both depths, as the paper's best rows do: twice the cost."""
 
     @property
     def checkpoint_path(self) -> Path | None:
         """The checkpoint's file; None for a network with random weights."""
         return None if self.untrained else checkpoint_path(self.checkpoint)
+
+    @property
+    def fusion(self) -> FlipFusion:
+        """What is fused."""
+        return "depth" if self.flip_fusion else "none"
 
     @property
     def notice(self) -> str:
@@ -79,7 +97,7 @@ class ModelSettings(Settings):
         """Return the checkpoint's network, or an untrained one; CheckpointError or ConfigError says what is wrong."""
         from cvcdepth_core.estimator import DepthEstimator
 
-        engine = self.model_dump(include={"backend", "precision", "cpu_fallback"})
+        engine = self.model_dump(include={"backend", "precision", "cpu_fallback"}) | {"flip_fusion": self.fusion}
         path = self._checked_path()
         if path is not None:
             return DepthEstimator.from_checkpoint(path, self.device, **engine)
@@ -146,6 +164,10 @@ class OutputSettings(Settings):
     """Merged cloud: metres from a camera above which points are left out."""
     cloud_voxel: float = Field(0.0, ge=0, le=100)
     """Merged cloud: edge in metres of the cubes that keep one point each, at least 0.01; 0 keeps all points."""
+    cloud_min_confidence: float = Field(0.0, ge=0, le=1)
+    """Clouds: confidence below which pixels make no points; 0 takes all."""
+    depth_min_confidence: float = Field(0.0, ge=0, le=1)
+    """Depth images: confidence below which depth is left unknown; 0 takes all."""
 
     @field_validator("cloud_voxel")
     @classmethod
@@ -159,7 +181,14 @@ class OutputSettings(Settings):
         """Which points the merged cloud keeps."""
         from cvcdepth_core.pointcloud import CloudLimits
 
-        return CloudLimits(self.cloud_stride, self.cloud_min_range, self.cloud_max_range, self.cloud_voxel)
+        return CloudLimits(
+            self.cloud_stride, self.cloud_min_range, self.cloud_max_range, self.cloud_voxel, self.cloud_min_confidence
+        )
+
+    @property
+    def needs_confidence(self) -> bool:
+        """Whether any output depends on confidence."""
+        return self.cloud_min_confidence > 0 or self.depth_min_confidence > 0
 
 
 class NodeParameters(OutputSettings, MissingCameraSettings, MatchingSettings, ModelSettings):
@@ -183,6 +212,10 @@ class NodeParameters(OutputSettings, MissingCameraSettings, MatchingSettings, Mo
     """Seconds of the very same picture after which a camera counts as frozen and is left out; 0 accepts any."""
     overlap_monitor: bool = True
     """Compare neighbouring cameras in their overlaps, to tell of a shifted mount or a dirty lens in /diagnostics."""
+    odometry_topic: str = ""
+    """Refinement only: a nav_msgs/Odometry topic with the vehicle's motion; empty: /tf has it, or else the pictures."""
+    publish_odometry: bool = False
+    """Publish the motion that the pictures tell as ~/odometry (nav_msgs/Odometry); its scale is that of the depth."""
     publish_tf: bool = True
     """Publish the camera poses of a rig file on /tf_static, but for frames that TF has already."""
     trace: str = ""

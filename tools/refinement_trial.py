@@ -27,7 +27,7 @@ import torch
 from numpy.typing import NDArray
 
 from cvcdepth_core.images.decoding import Picture
-from cvcdepth_core.images.rectifier import SurroundPreprocessor, to_tensor
+from cvcdepth_core.images.surround import SurroundPreprocessor, to_tensor
 from cvcdepth_core.model_choices import checkpoint_path
 from cvcdepth_core.networks import PoseNet
 from cvcdepth_core.networks.checkpoint import load_checkpoint
@@ -39,18 +39,19 @@ from cvcdepth_core.refinement.confidence import (
     ConfidenceMaps,
     fit_confidence_map,
 )
+from cvcdepth_core.refinement.drive import DriveRefiner
 from cvcdepth_core.refinement.moments import SurroundMoment
 from cvcdepth_core.refinement.mounts import MountSearch, RefinedMounts
 from cvcdepth_core.refinement.refiner import RefinedDepth, SurroundRefiner
 from cvcdepth_core.refinement.settings import RefinementSettings
-from cvcdepth_core.refinement.visual_odometry import VisualOdometry
-from cvcdepth_core.refinement.without_odometry import RefinerWithoutOdometry
 from cvcdepth_core.rendering.projection import axis_angle_to_rotation
 from cvcdepth_core.rig.pinhole import scale_intrinsics
 from cvcdepth_core.rig.poses import Pose, inverse
-from cvcdepth_core.rig.rig import Rig, load_rig_layout
+from cvcdepth_core.rig.rig import Rig
+from cvcdepth_core.rig.rig_file import load_rig_layout
 from cvcdepth_core.scoring.confidence import CalibrationTable, ConfidenceSamples, confidence_samples, sparsification
-from cvcdepth_core.scoring.ground_truth import SparseDepth
+from cvcdepth_core.scoring.sparse_depth import SparseDepth
+from cvcdepth_core.surround_depth import SurroundPictures
 from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings
 from cvcdepth_ros.evaluation.measuring import MeasuredSet, open_evaluation
 from cvcdepth_ros.messages.conversion import picture_from_message
@@ -141,27 +142,28 @@ def read(path: str, rig: Path | None) -> Recorded:
     with open_evaluation(job) as evaluation:
         measured = list(evaluation.sets(*evaluation.window))
         built = measured[0].estimated.rig
-        height, width = measured[0].estimated.depth.depth.shape[1:]
+        height, width = measured[0].estimated.result.depth.shape[1:]
         usual, fine = (SurroundPreprocessor(built, scale * height, scale * width) for scale in (1, 2))
         anchor = built.names.index(built.anchor)
         for one in measured:
-            moment = taken(one, usual, one.estimated.depth.pictures)
+            moment = taken(one, usual, one.estimated.result.pictures)
             larger = taken(one, fine, fine_pictures(one, fine))
             twist = network_twist(pose_network, sets[-1].moment, moment, anchor) if sets else None
             sets.append(TrialSet(moment, larger, one.truth, twist))
         estimator = evaluation.depths.estimator
-        pictures, fx = list(sets[0].moment.pictures), sets[0].moment.intrinsics[:, 0, 0]
-        network_ms = cpu_ms(lambda: estimator.estimate(pictures, fx), 7)
+        first = sets[0].moment
+        surround = SurroundPictures(first.pictures, first.present, first.intrinsics, first.base_T_camera, first.valid)
+        network_ms = cpu_ms(lambda: estimator.estimate(surround), 7)
     return Recorded(built, sets, network_ms)
 
 
 def taken(measured: MeasuredSet, preprocessor: SurroundPreprocessor, pictures: NDArray[np.uint8]) -> SurroundMoment:
     """Put a measured set together, its depth enlarged to the pictures' size."""
-    rig, images = measured.estimated.rig, measured.estimated.images
+    rig, images = measured.estimated.rig, measured.estimated.surround_set
     return SurroundMoment(
-        depth=enlarged_depth(measured.estimated.depth.depth, pictures.shape[2]),
+        depth=enlarged_depth(measured.estimated.result.depth, pictures.shape[2]),
         pictures=pictures,
-        present=measured.estimated.depth.present,
+        present=measured.estimated.result.present,
         intrinsics=preprocessor.intrinsics,
         valid=preprocessor.valid,
         base_T_camera=np.stack([camera.base_T_camera for camera in rig.cameras]),
@@ -174,7 +176,7 @@ def fine_pictures(measured: MeasuredSet, preprocessor: SurroundPreprocessor) -> 
     """Decode and rectify the set's images once more, larger."""
     pictures: list[Picture] = []
     for name, rectifier in preprocessor.rectifiers.items():
-        message = measured.estimated.images.images[name].message
+        message = measured.estimated.surround_set.images[name].message
         picture = picture_from_message(message, name, rectifier.reduction, rectifier.image_size)
         pictures.append(rectifier(picture, name, rectifier.reduction))
     return np.stack(pictures)
@@ -254,7 +256,7 @@ def refine_all(
     settings = replace(settings, distances=()) if motion == "neighbours" else settings
     maps = SHIPPED_MAPS if prior is None else ConfidenceMaps(IDENTITY, IDENTITY)
     refiner = SurroundRefiner(recorded.rig.neighbour_indices, settings, confidence_maps=maps)
-    aligning = RefinerWithoutOdometry(refiner, VisualOdometry()) if motion == "alignment" else None
+    aligning = DriveRefiner(recorded.rig.neighbour_indices, settings) if motion == "alignment" else None
     poses = network_poses(recorded.sets) if motion == "network" else None
     found = []
     for number in numbers:
@@ -264,7 +266,7 @@ def refine_all(
         if motion not in ("odometry", "neighbours"):
             moment = replace(moment, world_T_base=None if poses is None else poses[number])
         began = time.process_time()
-        refined = (aligning or refiner).refine(moment)
+        refined = refiner.refine(moment) if aligning is None else aligning.refine(moment).depth
         found.append((number, refined, 1e3 * (time.process_time() - began)))
     return [one for one in found if one[0] >= first]
 

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -82,7 +84,8 @@ def _checked(
     _refuse_unknown_to(network, spec, backend)
     _refuse_impossible(backend, device, precision)
     _refuse_missing(backend)
-    engine = _build(backend, network, spec, device, precision)
+    with _refusing_broken(backend):
+        engine = _build(backend, network, spec, device, precision)
     if backend != "torch_eager":
         check_parity(engine, network, spec, precision)
     return engine
@@ -117,7 +120,8 @@ def build_tensorrt(
     from cvcdepth_core.engines.onnx_engine import TensorRtEngine, engine_folder
 
     published = _published(network, spec, "tensorrt")
-    engine = TensorRtEngine(published, spec, place, precision, build=True)
+    with _refusing_broken("tensorrt"):
+        engine = TensorRtEngine(published, spec, place, precision, build=True)
     return engine_folder(published, spec, place, precision), check_parity(engine, network, spec, precision)
 
 
@@ -215,6 +219,16 @@ def _refuse_missing(backend: str) -> None:
     if not is_installed(backend):
         missing, remedy = ", ".join(_missing(backend)), _PACKAGES[backend][1]
         raise EngineError(f"backend {backend}: {missing} is not installed here: {remedy}")
+
+
+@contextmanager
+def _refusing_broken(backend: str) -> Iterator[None]:
+    """Turn what a broken installation, or a folder that cannot be written, raises into an EngineError of one line."""
+    try:
+        yield
+    except (ImportError, OSError) as error:
+        reason = " ".join(str(error).split())
+        raise EngineError(f"backend {backend}: cannot be made ready: {reason}") from error
 
 
 def _build(

@@ -49,7 +49,7 @@ class _View(NamedTuple):
 
 
 def _view(camera: Camera, height: int, width: int) -> _View:
-    rectifier = Rectifier(camera.calibration, height, width, camera.rectified)
+    rectifier = Rectifier(camera.calibration, height, width, camera.rectified, camera.aspect)
     return _View(rectifier, rectifier.visible & (self_occlusion_mask(camera, rectifier) > 0.5))
 
 

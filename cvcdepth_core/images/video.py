@@ -6,6 +6,8 @@ belongs to one camera, and is given all packets from a key frame on, in order: b
 by who reads it (`cvcdepth_ros.bags.video`).
 """
 
+from collections.abc import Callable
+from functools import partial
 from importlib.util import find_spec
 from typing import Any
 
@@ -13,6 +15,7 @@ import numpy as np
 
 from cvcdepth_core.errors import ImageError
 from cvcdepth_core.images.decoding import Picture
+from cvcdepth_core.images.h264_frames import FrameNumbers
 from cvcdepth_core.rig.calibration import MAX_PIXELS
 
 CODECS = {"h264": "h264", "h265": "hevc", "hevc": "hevc"}
@@ -65,6 +68,7 @@ class VideoDecoder:
         self._camera = camera
         self._count = 0
         self._context: Any = None
+        self._numbers = FrameNumbers()
 
     @property
     def is_ready(self) -> bool:
@@ -76,28 +80,31 @@ class VideoDecoder:
         self._context = None
 
     def decode(self, packet: bytes) -> Picture:
-        """Return the packet's picture, RGB [height, width, 3].
+        """Return the packet's picture, RGB [height, width, 3]; ImageError as for `take`."""
+        return self.take(packet)()
 
-        ImageError names the camera when it cannot be decoded: no key frame came before, the packet is damaged, the
-        stream shows its pictures in another order than it sends them (B-frames), or a picture is beyond measure.
+    def take(self, packet: bytes) -> Callable[[], Picture]:
+        """Take in a packet, and return what makes its picture, RGB [height, width, 3], for whoever wants it.
+
+        ImageError names the camera when it cannot be decoded: no key frame came before, packets are missing between,
+        the packet is damaged, the stream shows its pictures in another order than it sends them (B-frames), or a
+        picture is beyond measure.
         """
         frame = self._frame(packet)
         if frame.width * frame.height > MAX_PIXELS:
             raise ImageError(
                 f"camera {self._camera}: image of {frame.width}x{frame.height}; at most {MAX_PIXELS} pixels"
             )
-        picture: Picture = np.ascontiguousarray(frame.to_ndarray(format="rgb24"))
-        return picture
-
-    def skip(self, packet: bytes) -> None:
-        """Take in a packet whose picture is not wanted; ImageError as for `decode`."""
-        self._frame(packet)
+        return partial(_picture, frame)
 
     def _frame(self, packet: bytes) -> Any:
         if is_key_frame(self.codec, packet):
             self._context = self._context or self._new_context()
         elif self._context is None:
             raise ImageError(f"camera {self._camera}: {self.codec} packet without a key frame before it")
+        if self.codec == "h264" and not self._numbers.follows(packet):
+            self.reset()
+            raise ImageError(f"camera {self._camera}: {self.codec} packets are missing before this one")
         import av
 
         self._count += 1
@@ -121,6 +128,11 @@ class VideoDecoder:
         context = av.CodecContext.create(self.codec, "r")
         context.flags |= Flags.low_delay
         context.thread_count = 1  # more threads give pictures later
-        # What is missing is told, not painted over with what was there before.
-        context.options = {"max_pixels": str(MAX_PIXELS), "err_detect": "explode", "ec": "0"}
+        # What is missing is told. It is painted over all the same, since FFmpeg marks only such pictures as corrupt.
+        context.options = {"max_pixels": str(MAX_PIXELS), "err_detect": "explode"}
         return context
+
+
+def _picture(frame: Any) -> Picture:
+    picture: Picture = np.ascontiguousarray(frame.to_ndarray(format="rgb24"))
+    return picture

@@ -100,6 +100,8 @@ def align(previous: AlignedSet, current: AlignedSet, starts: Sequence[Twist] = (
     twist = min(coarse, key=lambda found: _cost(pairs[_LEVELS[0]], found))
     for level in _LEVELS[1:]:
         twist = _descended(pairs[level], twist)
+    # A start that is right already is not made better: the steps end within the pictures' noise of it.
+    twist = min((twist, *begun), key=lambda found: _cost(finest, found))
     return _result(finest, twist, cost_before)
 
 
@@ -271,8 +273,6 @@ def _result(pair: _Pair, twist: Twist, cost_before: float) -> AlignedMotion:
     variance = np.linalg.inv(damped) * 6 * cost if math.isfinite(cost) else np.diag(np.full(6, math.inf))
     covariance = np.asarray(variance, np.float64)
     problem = _problem(cameras, min(_LEAST_CAMERAS, len(pair.known)), agreement)
-    if problem is None and cost > cost_before:
-        problem = f"pictures agree no better than before: cost {cost:.2f} against {cost_before:.2f}"
     return AlignedMotion(twist, covariance, cost, cost_before, agreement, cameras, problem)
 
 

@@ -17,6 +17,7 @@ _LEAST = 10
 _SLOW, _MOVING = 0.1, 0.5  # metres per second
 _FASTEST_CHANGE = 20.0  # metres per second from one step to the next: more is a jump
 _SCALE = 1.2  # depth's own scale is hardly better
+_USABLE_SCALE = 2.0
 _LARGEST_ANGLE = 15.0  # degrees between the two directions
 _STEADY = 0.8  # length of the mean of unit vectors: below, directions vary too much to speak of one
 _LONGEST_LAG, _LAG_STEP, _LEAST_LAG = 0.5, 0.05, 0.15  # seconds
@@ -51,19 +52,42 @@ class OdometryCheck:
         """Take in the next step; only those whose aligned motion has no problem tell anything."""
         self._steps.append(step)
 
+    @property
+    def is_ready(self) -> bool:
+        """Whether enough is known to judge."""
+        return len(self._steps) >= _LEAST
+
+    def is_usable(self) -> bool:
+        """Whether the odometry may be used.
+
+        Of a scale that differs by less than a factor of two it may: on a rig that is new to the network it is rather
+        the depth's scale that is wrong, and matching by odometry mends that.
+        """
+        if self.problem() is None:
+            return True
+        times, seen, recorded = (np.array(column) for column in zip(*self._steps, strict=True))
+        moving = np.linalg.norm(seen[:, :3], axis=1) > _MOVING
+        others = _worse_than_scale(times, seen, recorded, moving)
+        return others is None and 1 / _USABLE_SCALE <= _scale(seen[moving], recorded[moving]) <= _USABLE_SCALE
+
     def problem(self) -> str | None:
         """Say what is wrong with the odometry, in one line; None while nothing is, or too little is known."""
-        if len(self._steps) < _LEAST:
+        if not self.is_ready:
             return None
         times, seen, recorded = (np.array(column) for column in zip(*self._steps, strict=True))
         moving = np.linalg.norm(seen[:, :3], axis=1) > _MOVING
-        return (
-            _jump(times, recorded)
-            or _standing(seen[moving], recorded[moving])
-            or _other_frame(seen[moving], recorded[moving])
-            or _lag(times, seen, recorded)
-            or _wrong_scale(seen[moving], recorded[moving])
-        )
+        return _worse_than_scale(times, seen, recorded, moving) or _wrong_scale(seen[moving], recorded[moving])
+
+
+def _worse_than_scale(
+    times: NDArray[np.float64], seen: NDArray[np.float64], recorded: NDArray[np.float64], moving: NDArray[np.bool_]
+) -> str | None:
+    return (
+        _jump(times, recorded)
+        or _standing(seen[moving], recorded[moving])
+        or _other_frame(seen[moving], recorded[moving])
+        or _lag(times, seen, recorded)
+    )
 
 
 def _jump(times: NDArray[np.float64], recorded: NDArray[np.float64]) -> str | None:
@@ -137,11 +161,14 @@ def _unlikeness(mine: NDArray[np.float64], shifted: NDArray[np.float64]) -> NDAr
     return np.asarray(1 - np.square(np.maximum(b @ a, 0.0)) / scale)
 
 
+def _scale(seen: NDArray[np.float64], recorded: NDArray[np.float64]) -> float:
+    return float(np.median(np.linalg.norm(recorded[:, :3], axis=1) / np.linalg.norm(seen[:, :3], axis=1)))
+
+
 def _wrong_scale(seen: NDArray[np.float64], recorded: NDArray[np.float64]) -> str | None:
     if len(seen) < _LEAST:
         return None
-    ratios = np.linalg.norm(recorded[:, :3], axis=1) / np.linalg.norm(seen[:, :3], axis=1)
-    ratio = float(np.median(ratios))
+    ratio = _scale(seen, recorded)
     if 1 / _SCALE <= ratio <= _SCALE:
         return None
     return f"odometry has another scale: it drives {ratio:.2f} times as far as the pictures show"

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -44,6 +45,19 @@ class RefinedDepth:
     """[N, H, W] in [0, 1] of the depth before refinement; 0 where nothing could be checked."""
     checked: NDArray[np.float32]
     """[N] share of each camera's pixels whose depth another picture could check."""
+    earlier: NDArray[np.int64]
+    """[N] how many earlier pictures of its own each camera was compared with."""
+    beside: NDArray[np.int64]
+    """[N] with how many of its neighbours."""
+
+
+class _Sources(NamedTuple):
+    """What one camera's picture is compared with."""
+
+    earlier: list[View]
+    """Its own, newest first."""
+    beside: list[View]
+    """Its neighbours' of the same set."""
 
 
 class SurroundRefiner:
@@ -78,7 +92,8 @@ class SurroundRefiner:
         return refined
 
     def _refined(self, moment: SurroundMoment, grid: GridSet) -> RefinedDepth:
-        swept = self._swept_all(moment, grid)
+        sources = [self._sources(moment, grid, camera) for camera in range(len(grid.depth))]
+        swept = self._swept_all(grid, sources)
         found = posterior(swept.cost, self.settings)
         checked = (swept.evidence >= _LEAST_EVIDENCE) & ~torch.isnan(grid.depth)
         depth = torch.from_numpy(moment.depth).to(self._device)
@@ -96,24 +111,29 @@ class SurroundRefiner:
             confidence=confidence(raw, self._maps.refined),
             prior_confidence=confidence(found.prior_right, self._maps.prior),
             checked=_to_numpy(checked.float().mean((1, 2))),
+            earlier=np.array([len(found.earlier) for found in sources]),
+            beside=np.array([len(found.beside) for found in sources]),
         )
 
-    def _swept_all(self, moment: SurroundMoment, grid: GridSet) -> SweepCost:
+    def _swept_all(self, grid: GridSet, sources: Sequence[_Sources]) -> SweepCost:
         """Return what is known of all cameras, stacked [N, ...]; costs include the prior's."""
-        swept = (self._swept(moment, grid, camera) for camera in range(len(grid.depth)))
+        swept = (self._swept(grid, camera, found) for camera, found in enumerate(sources))
         found = SweepCost(*(torch.stack(parts) for parts in zip(*swept, strict=True)))
         prior = self.settings.prior_weight * self.settings.log_ratios(self._device).abs()
         found.cost.add_(prior[:, None, None])
         return found
 
-    def _swept(self, moment: SurroundMoment, grid: GridSet, camera: int) -> SweepCost:
+    def _sources(self, moment: SurroundMoment, grid: GridSet, camera: int) -> _Sources:
+        pose = grid.world_T_camera[camera]
+        earlier = self._history.sources(camera, pose, self.settings.distances) if grid.placed else []
+        return _Sources(earlier, self._beside(moment, grid, camera) if self.settings.use_neighbours else [])
+
+    def _swept(self, grid: GridSet, camera: int, sources: _Sources) -> SweepCost:
         log_ratios = self.settings.log_ratios(self._device)
         view, depth = grid.view(camera), grid.depth[camera]
-        earlier = self._history.sources(camera, view.world_T_camera, self.settings.distances) if grid.placed else []
-        beside = self._beside(moment, grid, camera) if self.settings.use_neighbours else []
-        found = sweep(view, depth, [*earlier, *beside], log_ratios)
-        if earlier:
-            way = _way(view, earlier[-1])
+        found = sweep(view, depth, [*sources.earlier, *sources.beside], log_ratios)
+        if sources.earlier:
+            way = _way(view, sources.earlier[-1])
             found.cost.add_(guard_cost(way, view.intrinsics, (depth.shape[0], depth.shape[1]), log_ratios))
         return found
 

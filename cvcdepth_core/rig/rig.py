@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from cvcdepth_core.rig.calibration import Calibration
 from cvcdepth_core.rig.pinhole import PinholeView, rays_through
 from cvcdepth_core.rig.poses import Pose, check_rigid
+from cvcdepth_core.rig.view import Aspect, PicturePart, network_part
 
 MIN_NEIGHBOUR_OVERLAP_DEG = 2.0
 """Cameras whose images share a narrower strip than this are no neighbours: its pixels are too few to learn from."""
@@ -20,7 +21,10 @@ MIN_NEIGHBOUR_OVERLAP_DEG = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """One complete camera; the fields are described in `rig_file.CameraEntry`."""
+    """One complete camera; the fields are described in `rig_file.CameraEntry` and `rig_file.RigLayout`.
+
+    A view of a rig file is applied: R and P of the calibration, and the pose, are those of the view.
+    """
 
     name: str
     calibration: Calibration
@@ -28,6 +32,9 @@ class Camera:
     rectified: bool = False
     mask: Path | None = None
     mask_polygons: tuple[tuple[tuple[float, float], ...], ...] = ()
+    aspect: Aspect = "crop"
+    lens: str = ""
+    """What those cameras have in common that are views of one lens; empty for a camera with a lens of its own."""
 
     def __post_init__(self) -> None:
         check_rigid(self.base_T_camera, f"camera {self.name}: base_T_camera")
@@ -37,6 +44,10 @@ class Camera:
         """The rectified picture at its full size, seen from the camera's place in the base frame."""
         width, height = self.calibration.image_size
         return PinholeView(self.calibration.rectified_intrinsics, self.base_T_camera, height, width)
+
+    def network_part(self, height: int, width: int) -> PicturePart:
+        """Return which part of the rectified picture a network's picture of that size shows."""
+        return network_part(self.calibration, height, width, self.aspect)
 
 
 @dataclass(frozen=True)
@@ -94,6 +105,14 @@ class Rig:
         computed = {name: [other for other in self.names if frozenset((name, other)) in wide] for name in self.names}
         chosen = {name: self.given_neighbours.get(name, computed[name]) for name in self.names}
         return {name: [other for other in others if other in chosen] for name, others in chosen.items()}
+
+    @property
+    def lenses(self) -> list[list[int]]:
+        """The indices of the cameras of each lens: one, or those that are views of it."""
+        found: dict[str | int, list[int]] = {}
+        for index, camera in enumerate(self.cameras):
+            found.setdefault(camera.lens or index, []).append(index)
+        return list(found.values())
 
     @property
     def neighbour_indices(self) -> list[tuple[int, int]]:

@@ -5,8 +5,7 @@
 """
 
 import os
-from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import yaml
@@ -17,6 +16,7 @@ from cvcdepth_core.files import load_yaml, write_atomically
 from cvcdepth_core.rig.calibration import Calibration
 from cvcdepth_core.rig.poses import Pose, pose_from_quaternion, quaternion_from_rotation
 from cvcdepth_core.rig.rig import Camera, Rig
+from cvcdepth_core.rig.view import Aspect, View
 
 # What a ROS topic takes between two slashes, since output topics carry the camera's name.
 _TOPIC_PART = r"^[A-Za-z][A-Za-z0-9_]*$"
@@ -79,11 +79,19 @@ class CameraEntry(BaseModel):
     """Pose of the optical frame in the base frame; without it, that of `/tf_static`."""
     neighbours: tuple[str, ...] | None = None
     """Cameras that see some of the same space; without it, computed from the fields of view."""
+    view: View | None = None
+    """The pinhole view that is taken from its lens; without it, the one that P says. Of cameras with the same
+    `image_topic`, which are views of one lens, each has its own."""
 
     @property
     def stamp_offset_ns(self) -> int:
         """`stamp_offset` in nanoseconds: a stamp minus this is the time of the exposure."""
         return round(self.stamp_offset * 10**9)
+
+    @property
+    def is_turned(self) -> bool:
+        """Whether it looks another way than its lens, and hence has a frame of its own."""
+        return self.view is not None and self.view.yaw != 0.0
 
 
 class RigLayout(BaseModel):
@@ -95,6 +103,9 @@ class RigLayout(BaseModel):
     """The vehicle's frame (REP 105): x forward, y left, z up."""
     anchor: str | None = None
     """The camera whose stamp a set carries and whose motion the pose network estimates; without it, the first."""
+    aspect: Aspect = "crop"
+    """How pictures come into a network of another shape, by more than 10 %: what is too much is cut off (crop), borders
+    are left empty (pad), or pixels become wider or narrower than high (stretch)."""
     ground_height: float = Field(default=0.0, ge=-20, le=20, allow_inf_nan=False)
     """Metres of the ground in the base frame, below the vehicle as it stands; 0 where the base frame lies on the ground
     (REP 105's base_footprint), negative where it is higher. Networks that are told their rig need it."""
@@ -109,10 +120,8 @@ class RigLayout(BaseModel):
         repeated = sorted({name for name in names if names.count(name) > 1})
         if repeated:
             raise ValueError(f"two cameras are called {', '.join(repeated)}")
-        for topic, count in Counter(camera.image_topic for camera in self.cameras).items():
-            if count > 1:
-                sharing = [camera.name for camera in self.cameras if camera.image_topic == topic]
-                raise ValueError(f"image_topic: {topic} is that of {' and '.join(sharing)}")
+        for topic, sharing in self.views_by_image.items():
+            _check_views(topic, [camera for camera in self.cameras if camera.name in sharing])
         if self.anchor is not None and self.anchor not in names:
             raise ValueError(f"anchor: no camera is called {self.anchor}; there are {', '.join(names)}")
         for camera in self.cameras:
@@ -135,6 +144,14 @@ class RigLayout(BaseModel):
         """The anchor's name: the one given, or the first camera's."""
         return self.anchor or self.names[0]
 
+    @property
+    def views_by_image(self) -> dict[str, list[str]]:
+        """The names of the cameras of each image topic: one, or several views of one lens."""
+        found: dict[str, list[str]] = {}
+        for camera in self.cameras:
+            found.setdefault(camera.image_topic, []).append(camera.name)
+        return found
+
     def complete(
         self, calibrations: Mapping[str, Calibration] | None = None, base_T_cameras: Mapping[str, Pose] | None = None
     ) -> "Rig":
@@ -144,13 +161,12 @@ class RigLayout(BaseModel):
         """
         return Rig(
             cameras=tuple(
-                Camera(
-                    entry.name,
+                _camera(
+                    entry,
                     _calibration_of(entry, calibrations or {}),
                     _pose_of(entry, base_T_cameras or {}, self.base_frame),
-                    entry.rectified,
-                    entry.mask,
-                    entry.mask_polygons,
+                    self.aspect,
+                    lens=entry.image_topic if len(self.views_by_image[entry.image_topic]) > 1 else "",
                 )
                 for entry in self.cameras
             ),
@@ -184,6 +200,26 @@ def save_rig_layout(path: Path, layout: RigLayout, comment: str = "") -> None:
     relative = _with_masks(layout, lambda mask: Path(os.path.relpath(mask, path.parent)))
     content = relative.model_dump(mode="json", exclude_defaults=True)
     write_atomically(path, (header + yaml.safe_dump(content, sort_keys=False, default_flow_style=None)).encode())
+
+
+def _check_views(topic: str, cameras: Sequence[CameraEntry]) -> None:
+    """Raise ValueError where cameras of one image topic are not different views of one lens."""
+    names = " and ".join(camera.name for camera in cameras)
+    if len(cameras) > 1 and any(camera.view is None for camera in cameras):
+        raise ValueError(f"image_topic: {topic} is that of {names}; views of one lens have a view each")
+    if len({camera.view for camera in cameras}) < len(cameras):
+        raise ValueError(f"view: those of {names}, of one image_topic, are the same")
+    for field in ("camera_info_topic", "frame_id", "stamp_offset", "rectified", "calibration", "base_T_camera"):
+        if any(getattr(camera, field) != getattr(cameras[0], field) for camera in cameras):
+            raise ValueError(f"{field}: differs between {names}, which are views of one lens")
+
+
+def _camera(entry: CameraEntry, calibration: Calibration, base_T_camera: Pose, aspect: Aspect, lens: str) -> Camera:
+    rectified = entry.rectified
+    if entry.view is not None:
+        calibration, base_T_camera = entry.view.seen_from(calibration, base_T_camera, rectified)
+        rectified = False
+    return Camera(entry.name, calibration, base_T_camera, rectified, entry.mask, entry.mask_polygons, aspect, lens)
 
 
 def _calibration_of(entry: CameraEntry, calibrations: Mapping[str, Calibration]) -> Calibration:

@@ -111,9 +111,12 @@ class OverlapMonitor:
         self._limits = limits or MonitorLimits()
         self._names = rig.names
         self._poses = np.stack([camera.base_T_camera for camera in rig.cameras])
-        self._pairs = sorted({(min(pair), max(pair)) for pair in rig.neighbour_indices})
+        # Views of one lens move together and are dirty together: that they agree says nothing.
+        lens = {camera: number for number, cameras in enumerate(rig.lenses) for camera in cameras}
+        neighbours = [(i, j) for i, j in rig.neighbour_indices if lens[i] != lens[j]]
+        self._pairs = sorted({(min(pair), max(pair)) for pair in neighbours})
         wide = {frozenset((o.camera, o.neighbour)) for o in rig.overlaps if o.angle >= _LEAST_OVERLAP_DEG}
-        directed = [(i, j) for i, j in rig.neighbour_indices if frozenset((self._names[i], self._names[j])) in wide]
+        directed = [(i, j) for i, j in neighbours if frozenset((self._names[i], self._names[j])) in wide]
         self._correlations = {pair: self._trend() for pair in directed}
         self._disagreements = {pair: self._trend() for pair in self._pairs}
         self._sharpness = {camera: self._trend() for camera in range(len(rig.cameras))}

@@ -8,6 +8,7 @@ exchanged, hardly any does, and the rig with these two exchanged explains the sa
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import combinations, permutations
@@ -27,8 +28,6 @@ _DEPTHS = (1.5, 2.5, 4.0, 7.0, 14.0, 40.0, 1000.0)  # metres
 _WINDOW = 5  # pixels over which one plane must fit
 _FEWEST_PIXELS = 20
 
-_Pair = tuple[int, int]
-
 
 @dataclass(frozen=True, eq=False)
 class PlacedPictures:
@@ -42,10 +41,15 @@ class PlacedPictures:
     """[N, H, W], False outside of the raw picture and on the vehicle itself."""
     base_T_camera: NDArray[np.float64]
     """[N, 4, 4] metres."""
+    lenses: Sequence[Sequence[int]] | None = None
+    """Which cameras are views of one lens, and hence exchanged together; None: each has its own."""
 
 
 class Exchange(NamedTuple):
-    """Two cameras, with the photometric errors of their views before and after exchanging them."""
+    """Two cameras, with the photometric errors of their views before and after exchanging them.
+
+    Of several views of one lens they are the first ones.
+    """
 
     first: int
     second: int
@@ -67,22 +71,24 @@ def best_exchange(placed: PlacedPictures) -> Exchange | None:
     exchanged is the pose.
     """
     sweep = _Sweep(placed)
-    pairs = combinations(range(sweep.cameras), 2)
+    lenses = [tuple(lens) for lens in placed.lenses or [(camera,) for camera in range(sweep.cameras)]]
+    pairs = [pair for pair in combinations(lenses, 2) if len(pair[0]) == len(pair[1])]
     found = [(sweep.error(_exchanged(sweep, *pair)), *pair) for pair in pairs]
     known = [(float(error.mean()), first, second) for error, first, second in found if error is not None]
     if not known:
         return None
     _, first, second = min(known)
-    as_described = sweep.error(tuple(range(sweep.cameras)), of=(first, second))
-    exchanged = sweep.error(_exchanged(sweep, first, second), of=(first, second))
+    as_described = sweep.error(tuple(range(sweep.cameras)), of=(*first, *second))
+    exchanged = sweep.error(_exchanged(sweep, first, second), of=(*first, *second))
     if as_described is None or exchanged is None:
         return None
-    return Exchange(first, second, as_described, exchanged)
+    return Exchange(first[0], second[0], as_described, exchanged)
 
 
-def _exchanged(sweep: _Sweep, first: int, second: int) -> tuple[int, ...]:
+def _exchanged(sweep: _Sweep, first: Sequence[int], second: Sequence[int]) -> tuple[int, ...]:
     """Return which camera is in each place after the exchange."""
-    return tuple({first: second, second: first}.get(camera, camera) for camera in range(sweep.cameras))
+    places = dict(zip((*first, *second), (*second, *first), strict=True))
+    return tuple(places.get(camera, camera) for camera in range(sweep.cameras))
 
 
 class _Sweep:
@@ -97,7 +103,7 @@ class _Sweep:
         self._poses = torch.from_numpy(placed.base_T_camera).float()
         self._error = cache(self._pair_error)
 
-    def error(self, camera_at: tuple[int, ...], of: _Pair | None = None) -> NDArray[np.float64] | None:
+    def error(self, camera_at: tuple[int, ...], of: Sequence[int] | None = None) -> NDArray[np.float64] | None:
         """Return the mean error [S] over all views between two places, or those that a place `of` takes part in.
 
         `camera_at` says which camera is in each place. None where there is no such view.

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cvcdepth_core.rig.view import PicturePart
 from cvcdepth_core.scoring.ground_truth import sample_prediction
 from cvcdepth_core.scoring.sparse_depth import SparseDepth
 
@@ -54,12 +55,14 @@ def confidence_samples(
     truth: SparseDepth,
     min_depth: float = 0.0,
     max_depth: float = 80.0,
+    part: PicturePart | None = None,
 ) -> ConfidenceSamples:
     """Sample depth and confidence [h, w] at the truth's pixels; predictions are clamped to the range as scores are.
 
-    Left out are pixels without prediction and truth outside of the range (metres).
+    `part` is what of the truth's picture they show, as for `sample_prediction`. Left out are pixels without prediction
+    and truth outside of the range (metres).
     """
-    prediction, sure = sample_prediction(depth, truth), sample_prediction(confidence, truth)
+    prediction, sure = (sample_prediction(picture, truth, part) for picture in (depth, confidence))
     counted = ~np.isnan(prediction) & ~np.isnan(sure) & (truth.depth > min_depth) & (truth.depth < max_depth)
     clamped = np.clip(prediction[counted], min_depth, max_depth)
     return ConfidenceSamples(clamped, sure[counted], truth.depth[counted])

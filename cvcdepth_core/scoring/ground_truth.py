@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from cvcdepth_core.errors import ImageError
 from cvcdepth_core.rig.pinhole import PinholeView, rays_through
+from cvcdepth_core.rig.view import PicturePart
 from cvcdepth_core.scoring.sparse_depth import OcclusionFilter, SparseDepth
 
 _NEAREST_OVERLAP = 1.0
@@ -50,19 +51,25 @@ def overlap_pixels(truth: SparseDepth, view: PinholeView, neighbours: Sequence[P
     return seen
 
 
-def sample_prediction(prediction: NDArray[np.floating], truth: SparseDepth) -> NDArray[np.float64]:
+def sample_prediction(
+    prediction: NDArray[np.floating], truth: SparseDepth, part: PicturePart | None = None
+) -> NDArray[np.float64]:
     """Return `prediction` [h, w], resized bilinearly to the truth's size, at the truth's pixels [M].
 
-    NaN where any pixel that it is interpolated from is NaN. Raises ImageError when it is no picture.
+    `part` is what of the truth's picture the prediction shows; all of it, where it is not given. NaN outside of it, and
+    where any pixel that it is interpolated from is NaN. Raises ImageError when it is no picture.
     """
     if prediction.ndim != 2 or 0 in prediction.shape:
         raise ImageError(f"prediction: shape is {list(prediction.shape)}, expected [h, w]")
     height, width = prediction.shape
-    top, bottom, down = _interpolation(truth.rows, truth.height, height)
-    left, right, across = _interpolation(truth.columns, truth.width, width)
+    part = part or PicturePart(0.0, 0.0, truth.width, truth.height)
+    rows, columns = truth.rows - part.top, truth.columns - part.left
+    top, bottom, down = _interpolation(rows, part.height, height)
+    left, right, across = _interpolation(columns, part.width, width)
     upper = _blend(prediction[top, left], prediction[top, right], across)
     lower = _blend(prediction[bottom, left], prediction[bottom, right], across)
-    return _blend(upper, lower, down)
+    is_shown = _is_between(rows, part.height) & _is_between(columns, part.width)
+    return np.where(is_shown, _blend(upper, lower, down), np.nan)
 
 
 def downsample_ground_truth(depth: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:
@@ -77,8 +84,12 @@ def downsample_ground_truth(depth: NDArray[np.float32], height: int, width: int)
     return smaller
 
 
+def _is_between(positions: NDArray[np.floating], size: float) -> NDArray[np.bool_]:
+    return (positions >= -0.5) & (positions <= size - 0.5)
+
+
 def _interpolation(
-    positions: NDArray[np.int64], large: int, small: int
+    positions: NDArray[np.floating], large: float, small: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
     """Return for pixels of an axis of `large` their two neighbours of `small`, and the weight of the second."""
     at = np.clip((positions + 0.5) * small / large - 0.5, 0, small - 1)

@@ -7,9 +7,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 METRIC_NAMES = ("abs_rel", "sq_rel", "rmse", "rmse_log", "delta_1", "delta_2", "delta_3")
 
@@ -84,14 +82,3 @@ def median_ratio(prediction: NDArray[np.float64], truth: NDArray[np.float64]) ->
 def _lower_median(values: NDArray[np.float64]) -> float:
     middle = (len(values) - 1) // 2
     return float(np.partition(values, middle)[middle])
-
-
-def fuse_flipped(depth: Tensor, depth_of_flipped: Tensor) -> Tensor:
-    """Fuse `depth` [..., H, W] with that of the mirrored image, mirrored back ("pp"; Godard et al., 2017).
-
-    Each pass is trusted alone at one border, where it looked past occlusions; between them the mean counts.
-    """
-    u = torch.linspace(0, 1, depth.shape[-1], dtype=depth.dtype, device=depth.device)
-    left = 1 - (20 * (u - 0.05)).clamp(0, 1)
-    right = left.flip(-1)
-    return right * depth + left * depth_of_flipped + (1 - left - right) * (depth + depth_of_flipped) / 2

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the networks see differently from the losses: colour jitter (method section 2) and Hflip-S (section 7)."""
+"""What the networks see differently from the losses: colour jitter (method section 2), and the coins of Hflip-S."""
 
 from __future__ import annotations
 
@@ -10,13 +10,8 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
-from cvcdepth_core.networks import RigImages
-
 _LUMA = (0.299, 0.587, 0.114)
 """Weights of ITU-R BT.601, as image editors convert to grey."""
-
-LATERAL_AXIS = 1
-"""Of the vehicle: y, to the left (REP 103)."""
 
 FlipMode = Literal["none", "depth", "pose", "both"]
 
@@ -111,56 +106,3 @@ def _grey(images: Tensor) -> Tensor:
 def draw_flips(generators: Sequence[torch.Generator]) -> Tensor:
     """Toss one fair coin per sample, with its CPU generator: bool [B], for all its cameras and frames."""
     return torch.stack([torch.rand((), generator=generator) for generator in generators]) < 0.5
-
-
-def mirror(images: Tensor, flips: Tensor) -> Tensor:
-    """Mirror the samples of `images` [B, ..., W] left to right where `flips` [B] says so."""
-    return _where(flips, images.flip(-1), images)
-
-
-def mirror_motion(motions: Tensor, flips: Tensor, axis: int = 0) -> Tensor:
-    """Express motions [B, ..., 4, 4] in the mirrored world where `flips` [B] says so: T <- S T S.
-
-    S negates `axis`, the one across the image: x = 0 in an optical frame, `LATERAL_AXIS` in the vehicle's.
-    """
-    return _where(flips, _negated(_negated(motions, -2, axis), -1, axis), motions)
-
-
-def mirror_rig(rig: RigImages, flips: Tensor) -> RigImages:
-    """Mirror the world of the samples where `flips` [B] says so: every picture, and the rig that took them.
-
-    E -> S_v E S_c with S_v = diag(1, -1, 1, 1) across the vehicle and S_c = diag(-1, 1, 1, 1) across the image: a rig
-    that could be built, so that a network which looks at the mounts can be trained with flips too.
-    """
-    width = rig.images.shape[-1]
-    mounts = _negated(_negated(rig.base_T_camera, -2, LATERAL_AXIS), -1, 0)
-    return rig._replace(
-        images=mirror(rig.images, flips),
-        intrinsics=_where(flips, _mirrored_intrinsics(rig.intrinsics, width), rig.intrinsics),
-        base_T_camera=_where(flips, mounts, rig.base_T_camera),
-        masks=mirror(rig.masks, flips),
-    )
-
-
-def _mirrored_intrinsics(intrinsics: Tensor, width: int) -> Tensor:
-    """Return K [..., 3, 3] of the mirrored picture: the principal point changes sides, a skew its sign."""
-    mirrored = intrinsics.clone()
-    mirrored[..., 0, 1] *= -1
-    mirrored[..., 0, 2] = width - 1 - intrinsics[..., 0, 2]
-    return mirrored
-
-
-def _negated(matrices: Tensor, dimension: int, index: int) -> Tensor:
-    """Return [..., 4, 4] with one row (dimension -2) or column (-1) negated."""
-    signs = matrices.new_ones(4)
-    signs[index] = -1.0
-    return matrices * (signs[:, None] if dimension == -2 else signs)
-
-
-def _where(flips: Tensor, mirrored: Tensor, plain: Tensor) -> Tensor:
-    """Choose sample by sample, [B, ...]."""
-    return torch.where(_per_sample(flips, plain), mirrored, plain)
-
-
-def _per_sample(flips: Tensor, like: Tensor) -> Tensor:
-    return flips.to(like.device).view(-1, *[1] * (like.ndim - 1))

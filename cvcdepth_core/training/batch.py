@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from cvcdepth_core.errors import ImageError, RigError, TransformError
+from cvcdepth_core.rendering.projection import rigid_inverse
 from cvcdepth_core.rig.poses import check_rigid
 from cvcdepth_core.training.motion import poses_at_exposure
 
@@ -43,6 +44,9 @@ class RigBatch:
     """[B, N] seconds from the anchor's exposure to each camera's; None where `base_T_camera` is of the exposures."""
     context_times: Tensor | None = None
     """[B, F] seconds from the target to each context frame, negative for one before; needed with `exposure_delays`."""
+    recorded_poses: Tensor | None = None
+    """[B, 1 + F, N, 4, 4] each camera's recorded pose at each of its exposures, target first, all in one frame, and
+    `base_T_camera` that of the target; None where the losses take the pose network's motion."""
     truth: Tensor | None = None
     """[B, N, 1, H, W] metres along the optical axis; inf in the sky, NaN where it is not known."""
 
@@ -53,6 +57,7 @@ class RigBatch:
         _check_truth(self)
         _check_neighbours(self)
         _check_exposures(self)
+        _check_recorded_poses(self)
 
     @property
     def images(self) -> Tensor:
@@ -75,6 +80,13 @@ class RigBatch:
         inverse: Tensor = torch.linalg.inv_ex(self.intrinsics).inverse
         return inverse
 
+    @property
+    def recorded_motions(self) -> Tensor | None:
+        """[B, F, N, 4, 4] the recorded `context_T_target` of each camera; None where `recorded_poses` is."""
+        if self.recorded_poses is None:
+            return None
+        return rigid_inverse(self.recorded_poses[:, 1:]) @ self.recorded_poses[:, :1]
+
     def at_exposures(self, anchor_motion: Tensor) -> RigBatch:
         """Return the batch with every camera where it was when it fired, by the anchor camera's motion.
 
@@ -82,7 +94,7 @@ class RigBatch:
         follow a baseline of rig and predicted way, and the way's scale follow depth; where the way is opposite to the
         rig's baseline and more than half of it, that chase leads away from the true scale instead of to it.
         """
-        if self.exposure_delays is None or self.context_times is None:
+        if self.exposure_delays is None or self.context_times is None or self.recorded_poses is not None:
             return self
         moved = copy.copy(self)
         moved.base_T_camera = poses_at_exposure(
@@ -192,7 +204,7 @@ def _check_neighbours(batch: RigBatch) -> None:
     if batch.contexts.shape[1] == 0:
         return  # learns from truth alone
     lonely = [names[camera] for camera in range(cameras) if camera not in {target for target, _ in pairs}]
-    if lonely:
+    if lonely and batch.recorded_poses is None:
         raise RigError(f"camera {', '.join(lonely)}: no neighbour, so no overlap to learn its scale from")
 
 
@@ -209,3 +221,11 @@ def _check_exposures(batch: RigBatch) -> None:
             raise RigError(f"{name}: found {list(value.shape)} {value.tolist()}, expected finite seconds {shape}")
     if not bool(times.all()):
         raise RigError(f"context_times {times.tolist()}: a context frame is of the target's moment")
+
+
+def _check_recorded_poses(batch: RigBatch) -> None:
+    poses = batch.recorded_poses
+    expected = [*batch.frames.shape[:3], 4, 4]
+    if poses is None or (list(poses.shape) == expected and bool(torch.isfinite(poses).all())):
+        return
+    raise RigError(f"recorded_poses: shape is {list(poses.shape)}, expected finite poses {expected}")

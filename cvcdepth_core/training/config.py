@@ -13,12 +13,14 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from cvcdepth_core.errors import ConfigError, validation_messages
 from cvcdepth_core.files import load_yaml
 from cvcdepth_core.model_choices import EncoderName
+from cvcdepth_core.networks.pose import MAX_TRANSLATION
 from cvcdepth_core.networks.registry import DepthModelSpec
 from cvcdepth_core.training.augmentation import ColorJitterConfig, FlipMode
 from cvcdepth_core.training.model import PoseMethod
 from cvcdepth_core.training.objective import ObjectiveConfig
 
 ExposureMotion = Literal["auto", "recorded", "network", "none"]
+MotionSource = Literal["auto", "recorded", "network"]
 
 _BASE_KEY = "base"
 
@@ -52,11 +54,23 @@ class RecordingsConfig(_Section):
     """The last share of every recording's surround sets that is never trained on."""
     min_travel: float = Field(default=0.1, ge=0, allow_inf_nan=False)
     """Metres between a sample's target and each of its context frames, at least; nearer sets are passed over."""
+    max_travel: float = Field(default=MAX_TRANSLATION, gt=0, allow_inf_nan=False)
+    """Metres between them at most, where motion is recorded; with `motion: network` never more than the 4 that the pose
+    network can tell."""
     min_image_change: float = Field(default=2.0, ge=0, allow_inf_nan=False)
     """Instead of `min_travel` where no motion is recorded: mean absolute difference of the anchor camera's small grey
     pictures, of 255."""
+    further_travels: tuple[float, ...] = ()
+    """Where `motion` is recorded: further least distances, in metres; every epoch draws for each target whether it is
+    `min_travel` or one of these. Longer ways show depth that is far away, and the pose network other speeds."""
     max_interval: float = Field(default=0.5, gt=0, allow_inf_nan=False)
-    """Seconds from a target to a context frame, at most: a longer gap of the recording is not bridged."""
+    """Seconds from a target to a context frame, at most: a longer gap of the recording is not bridged. Where motion is
+    recorded, one and a half times the recording's own time from set to set is allowed too."""
+    motion: MotionSource = "network"
+    """From where the losses know how the cameras moved between a sample's sets: `network` (the pose network's answer,
+    as in the published method), `recorded` (odometry or /tf, from exposure to exposure of each camera, which the pose
+    network is taught too, see `objective.recorded_motion`), or `auto` (recorded where a recording has some, else of the
+    network). Recorded motion gives the scale, so that a camera needs no neighbour then."""
     exposure_motion: ExposureMotion = "auto"
     """How the vehicle moved between the exposures of one set, which gives the place of each camera when it fired:
     `recorded` (odometry or /tf), `network` (as the pose network says, at constant velocity between two sets), `auto`

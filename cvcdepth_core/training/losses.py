@@ -14,6 +14,8 @@ from cvcdepth_core.rendering.projection import rotation_to_euler_xyz
 
 _EPSILON = 1e-8
 _EULER_WEIGHT = 10.0
+_LEVER = 10.0  # metres ahead of a camera: what is there shall be seen where it is
+_LEAST_WAY = 0.1  # metres
 
 _OVER_IMAGE = (-3, -2, -1)
 
@@ -51,6 +53,25 @@ def pose_consistency(anchor_motions: Tensor, anchor: int) -> Tensor:
     euler = rotation_to_euler_xyz(anchor_motions[..., :3, :3])
     apart = _distance_to(anchor, translation) + _EULER_WEIGHT * _distance_to(anchor, euler)
     return apart.mean(dim=-2)
+
+
+def motion_error(motions: Tensor, true_motions: Tensor) -> Tensor:
+    """Return how wrong motions [..., 4, 4] are, as a share of the way: (|t - t*| + 10 m |R - R*|) / max(|t*|, 0.1 m).
+
+    |R - R*| is the chord, for small angles the angle in radians: with its lever, the error is about how far a point at
+    10 m is misplaced. Gives [...].
+    """
+    way = torch.linalg.vector_norm(true_motions[..., :3, 3], dim=-1).clamp(min=_LEAST_WAY)
+    apart = motions - true_motions
+    chord = _length(apart[..., :3, :3].flatten(-2)) / 2**0.5
+    error: Tensor = (_length(apart[..., :3, 3]) + _LEVER * chord) / way
+    return error
+
+
+def _length(vectors: Tensor) -> Tensor:
+    """Return the Euclidean norm, whose gradient is finite at zero too."""
+    length: Tensor = (vectors.square().sum(dim=-1) + _EPSILON).sqrt() - _EPSILON**0.5
+    return length
 
 
 def _distance_to(anchor: int, vectors: Tensor) -> Tensor:

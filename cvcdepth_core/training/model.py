@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from cvcdepth_core.networks import DepthNetwork, DepthOutputs, PoseNet, RigImages, disparity_to_depth
-from cvcdepth_core.training.augmentation import LATERAL_AXIS, mirror, mirror_motion, mirror_rig
+from cvcdepth_core.networks.mirroring import LATERAL_AXIS, mirror, mirror_motion, mirror_rig
 from cvcdepth_core.training.batch import RigBatch
 from cvcdepth_core.training.motion import distribute_anchor_motion, distribute_vehicle_motion, motion_to_context
 from cvcdepth_core.training.objective import Prediction

@@ -7,7 +7,7 @@ Every sample and camera is reduced on its own, so the loss of a batch is the mea
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import torch
@@ -27,7 +27,7 @@ from cvcdepth_core.rendering.view_synthesis import (
     warp_by_depth,
 )
 from cvcdepth_core.training.batch import RigBatch
-from cvcdepth_core.training.losses import auto_mask, pose_consistency, smoothness
+from cvcdepth_core.training.losses import auto_mask, motion_error, pose_consistency, smoothness
 from cvcdepth_core.training.motion import motions_seen_from_anchor, relative_poses
 from cvcdepth_core.training.truth_losses import LogErrors, sky_error
 
@@ -52,6 +52,9 @@ class ObjectiveConfig(BaseModel):
     """Weight of the difference between spatial and spatio-temporal reconstructions (MVRCL)."""
     pose_consistency: float = Field(default=0.0, ge=0)
     """Weight of the agreement of the cameras' own motions (FSM baseline: 0.1); only with one pose per camera."""
+    recorded_motion: float = Field(default=1.0, ge=0)
+    """Weight of the pose network's difference to the recorded motion, see `losses.motion_error`; there is no such term
+    where none is recorded, or `recordings.motion` does not take it."""
     truth: float = Field(default=1.0, ge=0)
     """Where depth is known (batches with truth): weight of the error of log depth; 0 leaves out all terms of truth."""
     truth_shape: float = Field(default=0.3, ge=0)
@@ -207,6 +210,8 @@ def _self_supervised_terms(
     if config.pose_consistency > 0:
         seen = motions_seen_from_anchor(prediction.motions, batch.base_T_camera, batch.anchor)
         terms["pose_consistency"] = pose_consistency(seen, batch.anchor)
+    if batch.recorded_motions is not None and config.recorded_motion > 0:
+        terms["recorded_motion"] = motion_error(prediction.motions, batch.recorded_motions).mean(dim=1)
     return terms
 
 
@@ -237,6 +242,7 @@ def _with_binary_masks(batch: RigBatch) -> RigBatch:
 def synthesise_views(batch: RigBatch, prediction: Prediction, config: ObjectiveConfig) -> Views:
     """Render every view that the terms of `config` compare: all samples, frames and cameras in two warps."""
     batch = batch.at_exposures(prediction.motions[:, :, batch.anchor])
+    prediction = _with_recorded_motions(batch, prediction)
     intrinsics, inverse = batch.intrinsics, batch.inverse_intrinsics
     targets = KnownView.from_images(batch.images)
     temporal = warp_by_depth(
@@ -260,20 +266,38 @@ def synthesise_views(batch: RigBatch, prediction: Prediction, config: ObjectiveC
     )
 
 
-def _synthesise_overlap(
-    batch: RigBatch, prediction: Prediction, whole_targets: KnownView, config: ObjectiveConfig
-) -> Overlap:
+def _with_recorded_motions(batch: RigBatch, prediction: Prediction) -> Prediction:
+    return prediction if batch.recorded_motions is None else replace(prediction, motions=batch.recorded_motions)
+
+
+def _source_T_target(batch: RigBatch, prediction: Prediction) -> Tensor:  # noqa: N802
+    """Return where each pair's target is seen from its neighbour at all moments, [B, 1 + F, P, 4, 4].
+
+    By predicted motion, neighbours lie to each other at a context moment as at the target's: velocity is constant.
+    """
+    if batch.recorded_poses is not None:
+        at_target = batch.recorded_poses[:, :1, batch.targets]
+        return rigid_inverse(batch.recorded_poses[:, :, batch.sources]) @ at_target
     source_T_target = relative_poses(batch.base_T_camera, batch.targets, batch.sources)
     standstill = torch.eye(4).to(prediction.motions).expand_as(prediction.motions[:, :1])
     frame_T_target = torch.cat([standstill, prediction.motions], dim=1)[:, :, batch.targets]
+    return source_T_target[:, None] @ frame_T_target
+
+
+def _synthesise_overlap(
+    batch: RigBatch, prediction: Prediction, whole_targets: KnownView, config: ObjectiveConfig
+) -> Overlap:
+    if not len(batch.targets):
+        return Overlap([], None)
+    source_T_target = _source_T_target(batch, prediction)
     source_of_target = Reprojection.from_cameras(
         batch.inverse_intrinsics[:, None, batch.targets],
-        source_T_target[:, None] @ frame_T_target,
+        source_T_target,
         batch.intrinsics[:, None, batch.sources],
     )
     seen = seen_columns(prediction.depth, batch.targets, source_of_target)
     groups = divide_into_strips(seen, batch.targets.tolist(), batch.cameras, prediction.depth.shape[-1])
-    target_T_source = rigid_inverse(source_T_target) if config.depth_consistency > 0 else None
+    target_T_source = rigid_inverse(source_T_target[:, 0]) if config.depth_consistency > 0 else None
     parts = []
     for strips in groups:
         pairs = list(strips.pairs)

@@ -94,5 +94,6 @@ def _refuse_other_meaning(start: Checkpoint, config: TrainingConfig) -> None:
         if found != want:
             at = f" at a width of {config.depth.width}" if name == "focal_scale" else ""
             raise CheckpointError(
-                f"{start.path}: {name} is {found}{at}, but the configuration's depth.{name} is {want}"
+                f"{start.path}: {name} is {found}{at}, but the configuration's depth.{name} is {want}; "
+                "who starts from weights keeps that value"
             )

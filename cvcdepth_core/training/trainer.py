@@ -325,7 +325,9 @@ class Trainer:
         if not values:
             return 0, 0.0, {}
         columns = {"": [value.per_sample for value in values]}
-        columns |= {name: [value.terms[name].flatten() for value in values] for name in values[0].terms}
+        for value in values:  # a term may be there for some recordings only
+            for name, term in value.terms.items():
+                columns.setdefault(name, []).append(term.flatten())
         joined = [torch.cat(column).double() for column in columns.values()]
         sums = torch.stack([torch.stack([column.sum(), torch.ones_like(column).sum()]) for column in joined])
         totals, counts = self._processes.sum_over_processes(sums).unbind(1)
@@ -336,8 +338,8 @@ class Trainer:
         """Turn the gradients' sum into the mean of all processes and shorten it if configured; return its length."""
         self._processes.sum_gradients_over_processes(list(self.model.parameters()))
         for parameter in self.model.parameters():
-            if parameter.grad is not None:
-                parameter.grad /= max(samples, 1)
+            if parameter.grad is not None and samples > 1:
+                parameter.grad /= samples
         limit = self.config.optimizer.max_gradient_norm or math.inf
         return float(nn.utils.clip_grad_norm_(self.model.parameters(), limit))
 

@@ -6,15 +6,19 @@ from __future__ import annotations
 from cvcdepth_core.errors import RigError
 from cvcdepth_core.rig.calibration import Calibration, RegionOfInterest, calibration_from_fields
 from cvcdepth_core.rig.rig_file import CameraEntry, RigLayout
+from cvcdepth_core.rig.wide_lenses import without_views
 
 
 def complete_layout(layout: RigLayout, where: str) -> RigLayout:
-    """Return the layout if every camera has its calibration and mount; RigError says `where` which is missing."""
+    """Return the layout if every camera has its calibration and mount; RigError says `where` which is missing.
+
+    What is simulated is the lenses' images, whatever views are taken from them.
+    """
     for camera in layout.cameras:
         for field in ("calibration", "base_T_camera"):
             if getattr(camera, field) is None:
                 raise RigError(f"{where}: camera {camera.name}: no {field}; a rig needs both to be simulated")
-    return layout
+    return without_views(layout)
 
 
 def layout_at_size(layout: RigLayout, size: tuple[int, int] | None, usual_width: int) -> RigLayout:

@@ -126,13 +126,17 @@ class Ros1File(BlockFile):
                 record = read_record(stream, offset, self.size)
             except DAMAGE as error:
                 record, reason = None, f" ({error_text(error)})"
-            if record is None:
+            before = index.counts.total(), len(index.blocks)
+            if record is not None:
+                self._add_record(stream, index, offset, record)
+            if record is None or record.is_cut:
+                of_cut = index.counts.total() - before[0]
                 self._report(
                     f"cut or unreadable from byte {offset} of {self.size} on{reason}, no index: "
-                    f"{index.counts.total()} messages of the {len(index.blocks)} chunks before it recovered"
+                    f"{before[0]} messages of the {before[1]} chunks before it recovered"
+                    + (f", and {of_cut} of the one that is cut" if of_cut else "")
                 )
                 break
-            self._add_record(stream, index, offset, record)
             offset = record.end
         return index
 
@@ -178,7 +182,7 @@ def _inner_records(record: Record, data: bytes) -> list[tuple[Record, bytes]]:
     if record.op != Op.CHUNK:
         return [(record, data)]
     content = chunk_content(record, data)
-    return [(inner, content[inner.start : inner.end]) for inner in records_in(content)]
+    return [(inner, content[inner.start : inner.end]) for inner in records_in(content, record.is_cut)]
 
 
 def _messages_in(records: Sequence[tuple[Record, bytes]]) -> list[StoredMessage]:

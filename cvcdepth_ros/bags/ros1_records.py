@@ -18,6 +18,7 @@ DAMAGE = (ValueError, LookupError, struct.error, EOFError, RuntimeError, OSError
 
 _MAX_HEADER_BYTES = 2**20  # real ones take some hundred
 _MAX_CHUNK_RECORDS = 2**20
+_COMPRESSIONS = ("bz2", "lz4")
 
 
 class Op(IntEnum):
@@ -37,6 +38,8 @@ class Record(NamedTuple):
     start: int
     """Byte of its data."""
     end: int
+    is_cut: bool = False
+    """Whether more was to come."""
 
     @property
     def op(self) -> int:
@@ -66,6 +69,9 @@ class Record(NamedTuple):
 def read_record(stream: IO[bytes], offset: int, size: int) -> Record | None:
     """Return the record at `offset`, None when no whole one is there in a stream of `size` bytes.
 
+    Of a chunk the beginning is enough: what was cut when the recorder died holds messages too. A compressed chunk that
+    was never finished says that it is empty, and reaches to the end of the file.
+
     Raises ValueError for a header beyond measure, or that is none.
     """
     stream.seek(offset)
@@ -77,7 +83,13 @@ def read_record(stream: IO[bytes], offset: int, size: int) -> Record | None:
     fields = fields_in(stream.read(length))
     data = _read_u32(stream)
     start = offset + 8 + length
-    return Record(fields, start, start + data) if data is not None and start + data <= size else None
+    if data is None:
+        return None
+    record = Record(fields, start, start + data)
+    is_unfinished = not data and record.op == Op.CHUNK and record.text("compression") in _COMPRESSIONS
+    if not is_unfinished and record.end <= size:
+        return record
+    return record._replace(end=size, is_cut=True) if record.op == Op.CHUNK else None
 
 
 def data_of(stream: IO[bytes], record: Record) -> bytes:
@@ -105,7 +117,7 @@ def fields_in(header: bytes) -> dict[str, bytes]:
 
 def chunk_content(chunk: Record, data: bytes) -> bytes:
     """Unpack a chunk into no more memory than it announces, whatever is packed in it."""
-    compression, size = chunk.text("compression"), chunk.number("size")
+    compression, size = chunk.text("compression"), chunk.number("size") or chunk.is_cut * MAX_BLOCK_BYTES
     if size > MAX_BLOCK_BYTES:
         raise ValueError(f"{size} bytes; at most {MAX_BLOCK_BYTES} are read at once")
     content = data
@@ -115,12 +127,12 @@ def chunk_content(chunk: Record, data: bytes) -> bytes:
         content = lz4.frame.LZ4FrameDecompressor().decompress(data, size + 1)
     elif compression != "none":
         raise ValueError(f"compression '{compression:.20}' is neither none, bz2 nor lz4")
-    if len(content) != size:
+    if len(content) != size and not chunk.is_cut:
         raise ValueError(f"does not hold the {size} bytes that it announces")
     return content
 
 
-def records_in(content: bytes) -> Iterator[Record]:
+def records_in(content: bytes, is_cut: bool) -> Iterator[Record]:
     """Give the records of a chunk's content; ValueError where they do not fill it, or there are endless ones."""
     stream, position = io.BytesIO(content), 0
     for _ in range(_MAX_CHUNK_RECORDS):
@@ -128,6 +140,8 @@ def records_in(content: bytes) -> Iterator[Record]:
             return
         record = read_record(stream, position, len(content))
         if record is None:
+            if is_cut:
+                return
             raise ValueError(f"no whole record at byte {position} of its {len(content)}")
         yield record
         position = record.end

@@ -117,7 +117,7 @@ class RecordedVideos:
             stream.decoder.reset()
             packets = self._from_key_frame(message, type_, stream.decoder.codec)
         for packet in packets:
-            stream.decoder.skip(_data(packet))
+            stream.decoder.take(_data(packet))
 
     def _from_key_frame(self, message: RecordedMessage, type_: str, codec: str) -> list[Any]:
         """Return the packets before this one from the last key frame on."""

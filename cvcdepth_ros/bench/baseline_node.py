@@ -66,8 +66,9 @@ class BaselineNode(Node):  # type: ignore[misc] # rclpy is not annotated
         self.create_timer(0.25, self._inputs.connect, clock=steady)
         self.create_timer(1.0, self._publish_diagnostics, clock=steady)
 
-    def _on_image(self, camera: str, message: Any) -> None:
-        for surround_set in self._synchroniser.add(camera, stamp_ns(message), message):
+    def _on_image(self, cameras: list[str], message: Any) -> None:
+        stamp = stamp_ns(message)
+        for surround_set in [found for name in cameras for found in self._synchroniser.add(name, stamp, message)]:
             try:
                 self._handle(surround_set)
             except CvcDepthError as error:

@@ -8,9 +8,16 @@ from typing import NamedTuple
 
 from cvcdepth_ros.checks.context import CheckContext, CheckOptions, CheckResult, Status
 from cvcdepth_ros.checks.picture_checks import check_brightness, check_places
-from cvcdepth_ros.checks.rig_checks import check_camera_infos, check_cameras, check_encodings, check_transforms
+from cvcdepth_ros.checks.rig_checks import (
+    check_camera_infos,
+    check_cameras,
+    check_encodings,
+    check_lenses,
+    check_transforms,
+)
 from cvcdepth_ros.checks.scene_checks import check_lidar, check_masks, check_motion, check_overlaps
 from cvcdepth_ros.checks.time_checks import check_sets, check_stamps
+from cvcdepth_ros.checks.training_checks import check_pose_network, check_training
 
 __all__ = ["CHECKS", "CheckContext", "CheckOptions", "CheckResult", "NumberedResult", "Status", "run_checks"]
 
@@ -27,6 +34,9 @@ CHECKS: Mapping[str, Callable[[CheckContext], CheckResult]] = {
     "encodings": check_encodings,
     "brightness": check_brightness,
     "places": check_places,
+    "training": check_training,
+    "pose network": check_pose_network,
+    "lenses": check_lenses,
 }
 
 

@@ -7,6 +7,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -17,9 +18,11 @@ from cvcdepth_core.images.decoding import Picture
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.rig.rig_file import RigLayout
 from cvcdepth_core.stamps import exposure_times
+from cvcdepth_core.training.config import RecordingsConfig
 from cvcdepth_ros.bags import RecordedMessage, Recording
 from cvcdepth_ros.messages.camera_discovery import RECORDED_IMAGE_TYPES
 from cvcdepth_ros.messages.conversion import picture_from_message
+from cvcdepth_ros.messages.recorded_changes import CalibrationHistory
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
 from cvcdepth_ros.recordings.motion import VehicleMotion, find_motion_link
 from cvcdepth_ros.recordings.refusals import Refusals
@@ -32,6 +35,7 @@ from cvcdepth_ros.surround_sets.synchronizer import SurroundSet, SurroundSynchro
 Status = Literal["passed", "warning", "failed", "skipped"]
 
 _DEFAULTS = MatchingSettings()
+_TRAINING = RecordingsConfig()
 _KEPT_SWEEPS = 3
 _SHOWN_SETS = 3
 
@@ -62,6 +66,10 @@ class CheckOptions:
     """The vehicle's frame where no rig file names it."""
     lidar: tuple[str, ...] | None = None
     """LiDAR topics; None for all of the recording, see `RigMessages.lidars`."""
+    training: RecordingsConfig = _TRAINING
+    """How training samples would be chosen."""
+    checkpoint: Path | None = None
+    """Weights whose pose network is compared with the recorded motion."""
     start: int | None = None
     """First log time to read, ns."""
     stop: int | None = None
@@ -99,6 +107,8 @@ class CheckContext:
         """Of each topic that may be a camera's; of CameraInfos where there is a rig file."""
         layout = self._chosen_layout(rig_layout)
         self.assembler = None if layout is None else self._assembled(messages, layout)
+        if self.assembler is not None and not self.has_rig_file:
+            self.assembler.split_wide_lenses()
         """None where the cameras make no rig, or the transforms contradict each other."""
         self.lidars = messages.lidars if options.lidar is None else options.lidar
         """The topics of the LiDARs."""
@@ -109,6 +119,8 @@ class CheckContext:
         """Impossible poses."""
         self.timings: dict[str, TopicTiming] = {}
         """Of the topics with images and LiDAR sweeps."""
+        self.calibrations = self._followed_calibrations()
+        """What the CameraInfos say; None where a rig file says it, or there are no cameras."""
         self.images: list[ImageTimes] = []
         """Every image, in the order of recording."""
         self.sweeps: dict[str, list[Any]] = defaultdict(list)
@@ -169,11 +181,13 @@ class CheckContext:
         sets = self.match(self.layout, self.options.tolerance)
         topics = {camera.name: camera.image_topic for camera in self.layout.cameras}
         for found in (sets[len(sets) * (2 * i + 1) // (2 * _SHOWN_SETS)] for i in range(min(_SHOWN_SETS, len(sets)))):
-            wanted = {(topics[camera], log_time): camera for camera, log_time in found.images.items()}
+            wanted: dict[tuple[str, int], list[str]] = defaultdict(list)
+            for camera, log_time in found.images.items():
+                wanted[topics[camera], log_time].append(camera)
             times = found.images.values()
             messages = self.recording.messages(set(topics.values()), min(times), max(times) + 1)
             read = {
-                wanted[key]: message for message in messages if (key := (message.topic, message.log_time)) in wanted
+                camera: message for message in messages for camera in wanted.get((message.topic, message.log_time), ())
             }
             pictures = {camera: self._picture(camera, message) for camera, message in read.items()}
             yield {camera: picture for camera, picture in pictures.items() if not isinstance(picture, str)}
@@ -200,13 +214,21 @@ class CheckContext:
         link = find_motion_link(self.recording, self.assembler.layout.base_frame, self.assembler.transforms)
         return None if link is None else VehicleMotion(link)
 
+    def _followed_calibrations(self) -> CalibrationHistory | None:
+        if self.has_rig_file or self.assembler is None:
+            return None
+        return CalibrationHistory(self.recording, self.assembler.layout, self.first_messages)
+
     def _read(self, progress: Callable[[int], None] | None) -> None:
         cameras = self._cameras_by_topic()
         moving = [self.motion.topic] if self.motion else []
-        topics = {*cameras, *self.lidars, *moving} & self.recording.topics.keys()
+        infos = self.calibrations.topics if self.calibrations else set()
+        topics = {*cameras, *self.lidars, *moving, *infos} & self.recording.topics.keys()
         for message in self.recording.messages(topics, self.options.start, self.options.stop):
             if message.topic in moving:
                 self._add_motion(message)
+            elif self.calibrations and message.topic in infos:
+                self.calibrations.add(message)
             else:
                 self._add_stamped(message, cameras.get(message.topic, ()))
             if progress:

@@ -65,7 +65,7 @@ def _placed_pictures(context: CheckContext, rig: Rig) -> PlacedPictures | None:
     if not sets:
         return None
     poses = np.stack([camera.base_T_camera for camera in rig.cameras])
-    return PlacedPictures(np.stack(sets), preprocessor.intrinsics, preprocessor.valid, poses)
+    return PlacedPictures(np.stack(sets), preprocessor.intrinsics, preprocessor.valid, poses, rig.lenses)
 
 
 def _judge(best: Exchange, rig: Rig) -> CheckResult:

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from cvcdepth_core.rig.lens_use import lens_uses
 from cvcdepth_ros.checks.context import CheckContext, CheckResult
 from cvcdepth_ros.messages.recorded_cameras import find_recorded_cameras
-from cvcdepth_ros.messages.recorded_changes import find_calibration_changes
 from cvcdepth_ros.messages.transforms import frame_name
 from cvcdepth_ros.recordings.fixed_frames import MOVING_TRANSFORMS
 from cvcdepth_ros.recordings.rig import topic_problems
@@ -72,10 +72,8 @@ def check_camera_infos(context: CheckContext) -> CheckResult:
     distinct = ", ".join(dict.fromkeys(sizes.values()))
     remedy = "calibrate the camera at the size that is recorded, or correct camera_info or the rig file"
     found = f"{len(sizes)} valid, of the images' size ({distinct})"
-    changes = []
-    if not problems and not context.has_rig_file:
-        changes = find_calibration_changes(context.recording, assembler.layout, context.first_messages)
-    if changes:
+    changes = context.calibrations.changes if context.calibrations else []
+    if changes and not problems:
         remedy = "take the parts before and after as two recordings"
         return CheckResult("warning", f"{found}; {'; '.join(changes[:_MAX_LISTED])}", remedy, {"changes": changes})
     return _judged(problems, remedy, found, {"sizes": sizes})
@@ -106,6 +104,22 @@ def check_transforms(context: CheckContext) -> CheckResult:
     else:
         remedy = f"publish the missing transform on {STATIC_TRANSFORMS}, or give base_T_camera in a rig file (--rig)"
     return _judged(problems, remedy, passed, values)
+
+
+def check_lenses(context: CheckContext) -> CheckResult:
+    """Compare what each camera shows with what its lens sees, and the overlaps that come of it."""
+    if context.rig is None or context.assembler is None:
+        return CheckResult("skipped", "needs all cameras with calibration and transform")
+    uses = lens_uses(context.assembler.completed_layout())
+    values = {"lenses": [use._asdict() for use in uses]}
+    wasted = [str(use) for use in uses if use.is_wasted]
+    if wasted:
+        remedy = "`cvcdepth rig BAG --view lens` writes a rig file (--rig) that shows all of each lens"
+        return CheckResult("warning", "; ".join(wasted), remedy, values)
+    angles = sorted({f"{use.lens:.0f}" for use in uses}, key=float)
+    found = f"{len(uses)} of {' to '.join(dict.fromkeys((angles[0], angles[-1])))} degrees, shown whole"
+    split = [f"{use.lens:.0f} degrees by {', '.join(use.cameras)}" for use in uses if len(use.cameras) > 1]
+    return CheckResult("passed", "; ".join([found, *split]), values=values)
 
 
 def check_encodings(context: CheckContext) -> CheckResult:

@@ -42,7 +42,10 @@ def check_overlaps(context: CheckContext) -> CheckResult:
     lonely = [name for name, others in neighbours.items() if not others]
     if lonely:
         remedy = "correct the calibration or transform; training needs overlaps, depth from a checkpoint does not"
-        status: Status = "failed" if len(lonely) == len(neighbours) > 1 else "warning"
+        if context.motion is not None:
+            remedy += f"; or odometry: with recordings.motion: auto the scale comes from {context.motion.topic}"
+        none_shared = len(lonely) == len(neighbours) > 1
+        status: Status = "failed" if none_shared and context.motion is None else "warning"
         return CheckResult(status, f"{', '.join(lonely)} shares no view with another camera", remedy, values)
     narrowest = min(values["degrees"], key=values["degrees"].__getitem__)
     finding = f"{len(pairs)} pairs of cameras, the narrowest {narrowest} ({values['degrees'][narrowest]:.1f} degrees)"

@@ -21,6 +21,7 @@ from cvcdepth_ros.commands.arguments import (
     recording_progress,
     refuse_unknown_checks,
     rig_layout,
+    training_file,
     window_ns,
 )
 from cvcdepth_ros.console import Style, positive, print_result, styled, terminal_width
@@ -33,8 +34,9 @@ if TYPE_CHECKING:
 
 SUMMARY = """Check whether recordings and a rig will work, with a remedy for what will not.
 
-Twelve numbered checks: cameras, calibrations, transforms, stamps, sets, overlaps, masks, LiDAR, motion, encodings,
-brightness, and whether two cameras were swapped. The exit code is 1 when a check failed; warnings leave it at 0."""
+Fifteen numbered checks: cameras, calibrations, transforms, stamps, sets, overlaps, masks, LiDAR, motion, encodings,
+brightness, whether two cameras were swapped, what `finetune` would learn from, a checkpoint's pose network, and how
+much of its lens each camera shows. The exit code is 1 when a check failed; warnings leave it at 0."""
 EXAMPLES: tuple[str, ...] = (
     "check drive.mcap",
     "check drives/ --rig rig.yaml --tolerance 0.05 --lidar /lidar/points --json",
@@ -73,6 +75,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help=f"seconds that two images of one set may be apart [{tolerance:g}]",
     )
+    parser.add_argument(
+        "--config",
+        default="finetune",
+        metavar="FILE",
+        help="training configuration by which samples and held-out sets are counted: YAML, or a shipped one [finetune]",
+    )
+    parser.add_argument(
+        "--checkpoint", metavar="FILE", help="compare this checkpoint's pose network with the recorded motion"
+    )
     add_lidar(parser)
     add_skip(parser)
     add_window(parser)
@@ -95,9 +106,13 @@ def execute(arguments: argparse.Namespace) -> None:
 
 
 def _checked(location: "Location", layout: "RigLayout | None", arguments: argparse.Namespace) -> Checked:
+    from cvcdepth_core.model_choices import checkpoint_path
+    from cvcdepth_core.training.config import load_training_config
     from cvcdepth_ros.bags import open_recording
     from cvcdepth_ros.checks import CheckContext, CheckOptions, run_checks
 
+    training = load_training_config(training_file(arguments.config)).recordings
+    checkpoint = None if arguments.checkpoint is None else checkpoint_path(arguments.checkpoint)
     try:
         with open_recording(location) as recording:
             window = window_ns(arguments, recording.start)
@@ -107,6 +122,8 @@ def _checked(location: "Location", layout: "RigLayout | None", arguments: argpar
                 lidar=lidar_topics(arguments),
                 start=window[0],
                 stop=window[1],
+                training=training,
+                checkpoint=checkpoint,
             )
             with recording_progress(recording, window, arguments.quiet) as progress:
                 context = CheckContext(recording, options, layout, progress)

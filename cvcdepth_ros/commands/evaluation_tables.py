@@ -14,17 +14,23 @@ from cvcdepth_ros.evaluation.image_scores import LabelFree, label_free_by_camera
 from cvcdepth_ros.evaluation.references import BEST_CONSTANT, reference_titles
 
 if TYPE_CHECKING:
+    from cvcdepth_core.scoring.confidence_scores import ConfidenceScores
     from cvcdepth_core.scoring.scores import Score
     from cvcdepth_ros.evaluation.measuring import RecordingScores
     from cvcdepth_ros.evaluation.result import EvaluationResult
 
 _SCORE_COLUMNS = ("abs_rel", "scaled", "scale", "rmse", "delta_1", "coverage", "truth")
 _LABEL_FREE_COLUMNS = ("between cameras", "along the way", "photo between", "photo along")
+_CONFIDENCE_COLUMNS = ("abs_rel", "surest half", "ause", "aurg")
 _NAME_WIDTH = 20
 
 _SCALED = (
     "scaled: abs_rel after scaling each image by median(truth) / median(prediction). best constant: for each image the "
     "depth with the least abs_rel, which only the truth tells."
+)
+_CONFIDENCE = (
+    "surest half: abs_rel of the half of the pixels with the largest confidence. ause: area above an oracle that "
+    "removes the worst pixels first, 0 is perfect; aurg: area won over removal at random; both over abs_rel."
 )
 _LABEL_FREE = (
     "No truth, so these are label-free scores, lower is better: by how much a point's depth differs between "
@@ -39,6 +45,8 @@ def evaluation_text(result: EvaluationResult, folder: Path) -> str:
     blocks = [_score_table(result) if has_truth else _label_free_table(result)]
     if len(result.recordings) > 1:
         blocks.append(_recordings_table(result, has_truth))
+    if result.confidence is not None and has_truth:
+        blocks.append(_confidence_table(result.confidence))
     return "\n\n".join(filter(None, [*blocks, "\n".join(_lines(result, folder))]))
 
 
@@ -51,6 +59,8 @@ def _lines(result: EvaluationResult, folder: Path) -> Iterator[str]:
             f"{seen.recording}: the model was trained on {seen.sets} of these {seen.scored} sets ({seen.trained_as}): "
             "its scores here do not tell how good it is elsewhere"
         )
+    if result.pose_score is not None:
+        yield f"pose network: {result.pose_score.describe()}"
     recordings = f"{len(result.recordings)} recording{'' if len(result.recordings) == 1 else 's'}"
     yield f"{len(result.sets)} sets of {recordings}, {result.truth_points} truth points"
     yield f"{folder}, of {result.model.id}"
@@ -69,6 +79,13 @@ def _score_table(result: EvaluationResult) -> str:
     ]
     rows = [_score_row(*row) for row in (*cameras, *groups, *references)]
     return f"{_numbers('', _SCORE_COLUMNS, rows)}\n\n{paragraph(_SCALED)}"
+
+
+def _confidence_table(confidence: ConfidenceScores) -> str:
+    found = {**confidence.cameras, ALL: confidence.mean}
+    rows = [(shortened(name, _NAME_WIDTH), *map(_number, numbers)) for name, numbers in found.items()]
+    off = f"Calibration: confidence is off by {_number(confidence.calibration.expected_error)} on average."
+    return f"{_numbers('confidence', _CONFIDENCE_COLUMNS, rows)}\n\n{paragraph(f'{_CONFIDENCE} {off}')}"
 
 
 def _label_free_table(result: EvaluationResult) -> str:

@@ -33,7 +33,8 @@ SUMMARY = """Train depth from recordings, without labels, and prove that it got 
 BAG needs overlapping cameras, their calibration and transforms, and a moving vehicle; what `check` finds wrong is told,
 or refused, before the first step. RUN becomes a folder with the checkpoints, model_card.md, report.html and logs.
 best.safetensors is there only when the held-out part of the recordings proves it better than the start: by the LiDAR,
-or without one by how well the depth explains the pictures. Otherwise the exit code is 3. The same command again goes on
+or without one by how well the depth explains the pictures. Otherwise the exit code is 3; where too little is held out
+to prove anything, nothing is trained, unless --no-promotion says so. The same command again goes on
 where a run that was interrupted or killed stood; with more epochs in the configuration, a finished one too."""
 EXAMPLES: tuple[str, ...] = (
     "finetune drives/ --config finetune --from model.safetensors -o run",
@@ -62,6 +63,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--no-masks", action="store_true", help="do not look for the vehicle's own body in the recordings"
     )
+    parser.add_argument(
+        "--no-promotion",
+        action="store_true",
+        help="train even where too little is held out to prove anything; no best.safetensors is written",
+    )
     add_lidar(parser)
     add_skip(parser)
     parser.add_argument("--device", default="auto", help="auto (CUDA where there is one), cpu, cuda, cuda:1 ... [auto]")
@@ -84,7 +90,7 @@ def execute(arguments: argparse.Namespace) -> None:
         return
     result = _written(finished, with_report)
     print_result(result, _text(result), arguments.json)
-    if not finished.verdict.promoted:
+    if finished.job.with_promotion and not finished.verdict.promoted:
         raise NotPromotedError(f"{arguments.output / BEST_FILE} is not written: {finished.verdict.reason}")
 
 
@@ -134,9 +140,11 @@ def _job(arguments: argparse.Namespace, config: "TrainingConfig") -> "FinetuneJo
         not arguments.no_masks,
         lidar_topics(arguments),
         arguments.base_frame,
+        config.recordings.motion,
     )
     start = None if arguments.start is None else load_checkpoint(checkpoint_path(arguments.start))
-    return FinetuneJob(source, config, arguments.output, start, arguments.device, arguments.quiet)
+    with_promotion = not arguments.no_promotion
+    return FinetuneJob(source, config, arguments.output, start, arguments.device, arguments.quiet, with_promotion)
 
 
 def _written(finished: "FinetuneResult", with_report: bool) -> dict[str, Any]:
@@ -163,16 +171,18 @@ def _written(finished: "FinetuneResult", with_report: bool) -> dict[str, Any]:
 
 
 def _text(result: dict[str, Any]) -> str:
+    from cvcdepth_ros.finetuning.card import pose_lines
+
     lines = [
         f"{entry['recording']}: {entry['training_samples']} training samples in {entry['sets']} sets of "
-        f"{len(entry['cameras'])} cameras, {entry['held_out_sets']} sets held out"
+        f"{len(entry['cameras'])} cameras, {entry['held_out_sets']} sets held out, motion: {entry['motion']}"
         for entry in result["recordings"]
     ]
     counts = f"{result['skipped_steps']} skipped, {result['unreadable_batches']} batches unreadable"
     early = ", ended early" if result["ended_early"] else ""
     lines.append(f"{result['epochs']} epochs, {result['steps']} steps ({counts}){early}")
     if result["scores"]["after"]:
-        lines.append(_score_table(result["scores"]))
+        lines += [_score_table(result["scores"]), *filter(None, pose_lines(result["scores"]))]
     lines.append(f"{'promoted' if result['promoted'] else 'not promoted'}: {result['verdict']['reason']}")
     return "\n".join([*lines, f"{result['checkpoint']}, started from {result['started_from']}"])
 

@@ -3,32 +3,46 @@
 
 import argparse
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 from pydantic import ValidationError
 
-from cvcdepth_core.errors import ConfigError, first_validation_message
+from cvcdepth_core.errors import ConfigError, RigError, first_validation_message
+from cvcdepth_core.rig.view import Aspect
 from cvcdepth_ros.commands.arguments import add_json, add_recording, add_rig, refuse_to_overwrite, rig_layout
-from cvcdepth_ros.console import print_result, table, warn
+from cvcdepth_ros.console import print_result, progress_bar, table, warn
 from cvcdepth_ros.installation import package_version
+from cvcdepth_ros.process_setup import prepare_long_work
 
 if TYPE_CHECKING:
     from cvcdepth_core.rig.rig import Camera, Rig
-    from cvcdepth_core.rig.rig_file import RigLayout
+    from cvcdepth_core.rig.rig_file import CameraEntry, RigLayout
     from cvcdepth_ros.recordings.rig import RecordedRig
+
+_NARROWEST_DEG = 5.0
 
 SUMMARY = """Write a rig file from a recording.
 
 Finds the cameras, takes their calibrations from camera_info and their poses from /tf_static, orders them
 counter-clockwise around the vehicle from the front one, and computes which of them see the same space. With --masks it
 finds where a camera sees the vehicle itself, which stands still in the picture while the scene moves, and writes a PNG
-for it beside the rig file. With --rig, a file that names the cameras only (config/rigs/) is completed."""
+for it beside the rig file. With --rig, a file that names the cameras only (config/rigs/) is completed. With --refine,
+the pictures themselves tell how the cameras are turned: small rotations that make neighbours agree where they overlap.
+
+With --view the cameras show so much of their lenses, whatever P of camera_info says. A lens of more than 120 degrees is
+shown by two or three virtual cameras, NAME_l, NAME_m and NAME_r."""
 EXAMPLES: tuple[str, ...] = (
     "rig drive.mcap",
     "rig drive/ -o rigs/shuttle.yaml --base-frame base_footprint --anchor front",
+    "rig drive.mcap --view lens",
+    "rig drive.mcap --view 98 --view back=170 --aspect pad",
+    "rig drive/ --rig rigs/shuttle.yaml --refine -o rigs/shuttle_refined.yaml",
 )
+
+
+_PARTS, _PART_SECONDS = 4, 2.5  # of the recording, that neighbours are compared in
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -40,12 +54,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_rig(parser, "the cameras found in the recording")
     parser.add_argument("--anchor", metavar="NAME", help="camera whose stamp a set carries [the front one]")
     parser.add_argument(
+        "--view", action="append", default=[], metavar="[NAME=]DEGREES",
+        help="horizontal view of all cameras or of one; 'lens': all that it sees; can be repeated [as P says]",
+    )  # fmt: skip
+    parser.add_argument(
+        "--aspect", choices=get_args(Aspect),
+        help="how pictures come into a network of another shape: cut off, with empty borders, or stretched [crop]",
+    )  # fmt: skip
+    parser.add_argument(
         "--ground-height",
         type=float,
         metavar="M",
         help="how high the ground lies in the base frame, metres: below 0 where that is above it [0]",
     )
     parser.add_argument("--masks", action="store_true", help="find the vehicle's own body (reads the whole recording)")
+    parser.add_argument(
+        "--refine", action="store_true", help="turn cameras until neighbours' pictures agree (runs the network)"
+    )
+    parser.add_argument(
+        "--checkpoint", default="", metavar="FILE", help="with --refine: the network's weights [the package's own]"
+    )
     parser.add_argument("--force", action="store_true", help="overwrite the rig file and its masks")
     add_json(parser)
 
@@ -62,8 +90,13 @@ def execute(arguments: argparse.Namespace) -> None:
         given = rig_layout(arguments)
         recorded = RecordedRig.from_recording(recording, given, arguments.base_frame)
         recorded = recorded if given is None else recorded.completed()
-        layout = _with_ground(recorded.layout, arguments.ground_height)
-        layout = layout.model_copy(update={"anchor": _anchor(layout, arguments.anchor)})
+        layout = _with_ground(_with_views(recorded.layout, arguments.view), arguments.ground_height)
+        layout = layout.model_copy(
+            update={
+                "anchor": _anchor(layout, arguments.anchor),
+                "aspect": arguments.aspect or layout.aspect,
+            }
+        )
         path, shares = recording.path, dict[str, float]()
         for note in recorded.notes():
             warn(f"{path}: {note}")
@@ -72,7 +105,10 @@ def execute(arguments: argparse.Namespace) -> None:
             if not arguments.force:
                 refuse_to_overwrite(*(folder / f"{name}.png" for name in layout.names))
             layout, shares = _with_found_masks(recorded.with_layout(layout), folder)
-    result = _describe(layout, layout.complete(), shares)
+        mounts: dict[str, Any] = {}
+        if arguments.refine:
+            layout, mounts = _with_refined_mounts(recorded.with_layout(layout), arguments.checkpoint)
+    result = {**_describe(layout, layout.complete(), shares), **mounts}
     source = f"cvcdepth rig {package_version()}, from the recording {path.name}"
     save_rig_layout(arguments.output, layout, f"Written by {source}.\n{_overlaps_text(result)}")
     result = {"file": str(arguments.output), "recording": arguments.recording, **result}
@@ -85,11 +121,65 @@ def _with_found_masks(recorded: "RecordedRig", folder: Path) -> tuple["RigLayout
     from cvcdepth_ros.training_data.index import index_recording
     from cvcdepth_ros.training_data.own_body_masks import find_self_occlusion, save_masks
 
-    found = find_self_occlusion(index_recording(recorded.completed(), MatchingSettings(), needs_overlaps=False))
+    found = find_self_occlusion(index_recording(recorded.completed(), MatchingSettings(), scale_from="nothing"))
     for doubt in found.doubts(folder):
         warn(f"{recorded.recording.path}: {doubt}")
     shares = {name: round(body.share, 4) for name, body in found.by_camera.items()}
     return save_masks(recorded.layout, found, folder), shares
+
+
+def _with_views(layout: "RigLayout", wanted: Sequence[str]) -> "RigLayout":
+    """Return the layout with the views of `--view`; a later one replaces an earlier one's."""
+    from cvcdepth_core.rig.wide_lenses import lens_name, with_views, without_views
+
+    topics = {lens_name(names): topic for topic, names in layout.views_by_image.items()}
+    chosen: dict[str, str] = {}
+    for text in wanted:
+        name, separator, degrees = text.rpartition("=")
+        if separator and name not in topics:
+            raise ConfigError(f"view {text}: no camera is called {name}; there are {', '.join(topics)}")
+        chosen.update(dict.fromkeys([name] if separator else topics, degrees))
+    layout = without_views(layout, [topics[name] for name in chosen])
+    entries = {entry.name: entry for entry in layout.cameras}
+    return with_views(layout, {name: _view_degrees(entries[name], text) for name, text in chosen.items()})
+
+
+def _view_degrees(entry: "CameraEntry", text: str) -> float:
+    from cvcdepth_core.rig.lens import field_of_view
+
+    lens = math.inf if entry.calibration is None else field_of_view(entry.calibration, entry.rectified).horizontal
+    if text == "lens":
+        return lens
+    try:
+        degrees = float(text)
+    except ValueError as error:
+        raise ConfigError(f"view {text}: want degrees, or 'lens'") from error
+    if not _NARROWEST_DEG <= degrees <= lens + 1:
+        raise ConfigError(f"view {text}: camera {entry.name} has a lens of {lens:.1f} degrees")
+    return degrees
+
+
+def _with_refined_mounts(recorded: "RecordedRig", checkpoint: str) -> tuple["RigLayout", dict[str, Any]]:
+    """Return the layout with turned cameras, and what tells of it; RigError where the pictures carry no turn."""
+    from cvcdepth_ros.recordings.compared_pictures import compare_pictures, mounts_to_json, parts_of, turned_layout
+    from cvcdepth_ros.settings import MatchingSettings, ModelSettings
+
+    prepare_long_work()
+    recording, settings = recorded.recording, ModelSettings.model_validate({"checkpoint": checkpoint})
+    parts = parts_of(recording.start, recording.end + 1, _PARTS, _PART_SECONDS)
+    with progress_bar(1.0, "of the search", is_kept=False) as show:
+        compared = compare_pictures(recorded, settings.build_estimator(), parts, MatchingSettings(), show)
+    told = mounts_to_json(compared.rig, compared.mounts)
+    used = [pair for pair in told["pairs"] if pair["problem"] is None]
+    if not used:
+        first = told["pairs"][0]["problem"] if told["pairs"] else "no two cameras overlap"
+        raise RigError(f"{recording.path}: --refine: no pair of neighbours tells how its cameras are turned: {first}")
+    for name, turn in told["turns"].items():
+        if turn is None:
+            warn(
+                f"{recording.path}: camera {name}: no pair of neighbours leads to {compared.rig.anchor}; left as it is"
+            )
+    return turned_layout(recorded.layout, compared.mounts), {"refined": told}
 
 
 def _with_ground(layout: "RigLayout", height: float | None) -> "RigLayout":
@@ -125,7 +215,7 @@ def _describe(layout: "RigLayout", rig: "Rig", masked: Mapping[str, float]) -> d
                 "mask": str(entry.mask) if entry.mask else None,
                 "masked_share": masked.get(camera.name),
                 "metres_above_ground": round(heights[camera.name], 3),
-                **_view(camera),
+                **_view(entry, camera),
             }
             for entry, camera in zip(layout.cameras, rig.cameras, strict=True)
         ],
@@ -141,15 +231,19 @@ def _describe(layout: "RigLayout", rig: "Rig", masked: Mapping[str, float]) -> d
     }
 
 
-def _view(camera: "Camera") -> dict[str, Any]:
+def _view(entry: "CameraEntry", camera: "Camera") -> dict[str, Any]:
     """Return the camera's direction, field of view, and the kind of its pictures."""
+    from cvcdepth_core.rig.lens import field_of_view
+
     calibration = camera.calibration
+    lens = field_of_view(entry.calibration or calibration, entry.rectified).horizontal
     axis = camera.base_T_camera[:3, 2]
     (fx, _, cx), (width, height) = calibration.rectified_intrinsics[0], calibration.image_size
     view = math.atan((width - 0.5 - cx) / fx) + math.atan((cx + 0.5) / fx)
     return {
         "yaw_degrees": round(math.degrees(math.atan2(axis[1], axis[0])), 2),
         "horizontal_view_degrees": round(math.degrees(view), 2),
+        "lens_degrees": round(lens, 2),
         "width": width,
         "height": height,
         "distortion": calibration.distortion_model if any(calibration.d) else "none",
@@ -162,7 +256,7 @@ def _text(result: dict[str, Any]) -> str:
         (
             camera["name"],
             f"{camera['yaw_degrees']:.1f}",
-            f"{camera['horizontal_view_degrees']:.1f}",
+            _view_text(camera),
             f"{camera['metres_above_ground']:.2f}",
             f"{camera['width']}x{camera['height']}",
             "rectified" if camera["rectified"] else camera["distortion"],
@@ -171,12 +265,43 @@ def _text(result: dict[str, Any]) -> str:
         )
         for camera in result["cameras"]
     ]
+    refined = f"{_refined_text(result['refined'])}\n\n" if "refined" in result else ""
     header = ("camera", "yaw (deg)", "view (deg)", "height (m)", "size", "distortion", "mask", "images")
     return (
-        f"{table(header, cameras, apart=len(header) - 1)}\n\n{_overlaps_text(result)}\n\n"
+        f"{table(header, cameras, apart=len(header) - 1)}\n\n{_overlaps_text(result)}\n\n{refined}"
         f"base frame {result['base_frame']}, the ground at {result['ground_height']:g} m in it (--ground-height; some "
         f"networks need it), anchor camera {result['anchor']}; written to {result['file']}"
     )
+
+
+def _view_text(camera: dict[str, Any]) -> str:
+    view, lens = camera["horizontal_view_degrees"], camera["lens_degrees"]
+    return f"{view:.1f}" if abs(lens - view) < 1 else f"{view:.1f} of {lens:.1f}"
+
+
+def _refined_text(refined: dict[str, Any]) -> str:
+    """Show how well neighbours' pictures agree, and how each camera was turned."""
+    pairs = [
+        (
+            f"{p['camera']} - {p['neighbour']}",
+            str(p["patches"]),
+            _number(p["before"]),
+            _number(p["after"]),
+            p["problem"],
+        )
+        for p in refined["pairs"]
+    ]
+    header = ("pair", "patches", "correlation", "turned", "")
+    shown = table(header, [(*pair[:-1], pair[-1] or "") for pair in pairs], numbers=range(1, 4), apart=4)
+    turns = [
+        f"  {name}: {'left as it is' if turn is None else ' '.join(f'{angle:+.2f}' for angle in turn)}"
+        for name, turn in refined["turns"].items()
+    ]
+    return "\n".join([shown, "", "Turned about its own x (right), y (down) and z (ahead), in degrees:", *turns])
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
 
 
 def _mask_text(camera: dict[str, Any]) -> str:

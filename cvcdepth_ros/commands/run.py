@@ -55,6 +55,13 @@ class RunSettings(OutputSettings, MissingCameraSettings, MatchingSettings, Model
 
     clouds: Literal["merged", "all", "none"] = "merged"
     """Clouds to store: the merged one, each camera's organised one too, or none."""
+    confidence: bool = False
+    """Store how sure depth is also where it is not refined; refined depth always has its confidence."""
+
+    @property
+    def has_confidence(self) -> bool:
+        """Whether confidence is computed and stored."""
+        return self.confidence or self.needs_confidence or self.refine != "off"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -85,7 +92,7 @@ def execute(arguments: argparse.Namespace) -> None:
 
         replay = SurroundReplay(_recorded_rig(arguments, recording), settings, settings.min_cameras)
         with _trace(arguments.trace) as latencies:
-            depths = DepthReplay(replay, settings.build_estimator(), latencies)
+            depths = DepthReplay(replay, settings.build_estimator(), latencies, settings, settings.has_confidence)
             outcome = _record(arguments, settings, replay, depths)
         result = {
             "version": package_version(),
@@ -133,7 +140,9 @@ def _record(
     began = time.monotonic()
     with (
         _stoppable() as stop,
-        DepthRecorder(arguments.output, replay, settings, settings.clouds, window[0]) as recorder,
+        DepthRecorder(
+            arguments.output, replay, settings, settings.clouds, window[0], settings.has_confidence
+        ) as recorder,
     ):
         sets = depths.sets(*window, recorder.handlers)
         seconds = (min(window[1] or replay.recording.end, replay.recording.end) - window[0]) / 1e9
@@ -193,6 +202,7 @@ def _outcome(replay: "SurroundReplay", depths: "DepthReplay", written: int, seco
             "refused": depths.refused.count,
         },
         "images": {name: asdict(camera) for name, camera in statistics.cameras.items()},
+        "refinement": depths.refinement.summary(),
         "refused": depths.refused.reasons + replay.unreadable.reasons,
         "seconds": {"total": round(seconds, 3), **{stage: round(total, 3) for stage, total in stages.items()}},
     }
@@ -227,10 +237,21 @@ def _text(result: dict[str, Any]) -> str:
             *(f"note: {note}" for note in result["notes"]),
             f"{sets['written']} sets written of {sets['matched']} matched; {sets['incomplete']} incomplete, "
             f"{sets['refused']} refused",
+            *_refinement_text(result["refinement"]),
             f"{seconds['total']:.1f} s: {stages}",
             f"{result['output']}, by {result['model']}",
         ]
     )
+
+
+def _refinement_text(summary: dict[str, Any] | None) -> list[str]:
+    """Say where the motion came from that pictures were compared by."""
+    if summary is None:
+        return []
+    counts = summary["motion"]
+    told = [f"motion from {counts['odometry']} sets' odometry, {counts['alignment']} sets' pictures"]
+    told = [f"{told[0]}; {counts['unknown']} sets compared with neighbours only"]
+    return told + ([f"odometry not used: {summary['odometry_problem']}"] if summary["odometry_problem"] else [])
 
 
 def _reasons(dropped: dict[str, int]) -> str:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from pydantic import Field, model_validator
 
+from cvcdepth_core.model_choices import FlipFusion
 from cvcdepth_ros.installation import package_version
 from cvcdepth_ros.settings import LIDAR_TOLERANCE, MatchingSettings, ModelSettings
 
@@ -44,12 +45,16 @@ class EvaluationSettings(MatchingSettings, ModelSettings):
     """Metres; truth at or below it is left out, predictions are clamped to it."""
     max_depth: float = Field(80.0, gt=0, le=1e4)
     """Metres; truth at or beyond it is left out, predictions are clamped to it, and label-free scores stop there."""
+    flip_fusion_of: Literal["depth", "inverse_depth"] = "depth"
+    """With flip-fusion: fuse depth (as CVCDepth) or inverse depth (as SurroundDepth)."""
     truth: Literal["lidar", "depth"] = "lidar"
     """What depth is scored against: LiDARs, or depth images beside the pictures, as `simulate` records them."""
     lidar_tolerance: float = Field(LIDAR_TOLERANCE, ge=0, le=10)
     """Seconds that a LiDAR sweep may be from the image that it is the truth of."""
     no_occlusion_filter: bool = False
     """Take every LiDAR point for truth, also those that the camera cannot see behind a nearer surface."""
+    confidence: bool = False
+    """Score how sure depth is also where it is not refined; refined depth always has its confidence."""
     threads: int = Field(1, ge=1, le=1024)
     """CPU threads of each worker's network. Results are repeatable to the last bit for the same number."""
 
@@ -58,6 +63,11 @@ class EvaluationSettings(MatchingSettings, ModelSettings):
         if self.min_depth >= self.max_depth:
             raise ValueError(f"min-depth {self.min_depth:g} must be below max-depth {self.max_depth:g}")
         return self
+
+    @property
+    def fusion(self) -> FlipFusion:
+        """What is fused."""
+        return self.flip_fusion_of if self.flip_fusion else "none"
 
     @property
     def scores(self) -> ScoreSettings:
@@ -73,6 +83,16 @@ class EvaluationSettings(MatchingSettings, ModelSettings):
         from cvcdepth_core.scoring.sparse_depth import OcclusionFilter
 
         return None if self.no_occlusion_filter else OcclusionFilter()
+
+    @property
+    def replayed(self) -> ModelSettings:
+        """What is made of the predictor's depth; a reference looks at no picture, and its depth is left as it is."""
+        return self.model_copy(update={"refine": "off"}) if self.predictor else self
+
+    @property
+    def has_confidence(self) -> bool:
+        """Whether confidence is computed and scored."""
+        return self.confidence or self.replayed.refine != "off"
 
     @property
     def checkpoint_path(self) -> Path | None:

@@ -19,6 +19,8 @@ from cvcdepth_core.errors import RecordingError
 from cvcdepth_core.estimator import DepthPredictor
 from cvcdepth_core.rendering.agreement import PosedDepth
 from cvcdepth_core.rig.poses import Pose
+from cvcdepth_core.rig.view import PicturePart
+from cvcdepth_core.scoring.confidence_scores import ConfidenceScorer, ConfidenceScores
 from cvcdepth_core.scoring.consistency import AgreementTable, spatial_rows, temporal_rows
 from cvcdepth_core.scoring.ground_truth import overlap_pixels, sample_prediction
 from cvcdepth_core.scoring.scorer import DepthSamples, SurroundScorer
@@ -28,6 +30,7 @@ from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_core.visualization import Points
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.evaluation.job import EvaluationJob
+from cvcdepth_ros.evaluation.pose_scores import PoseScoring
 from cvcdepth_ros.evaluation.references import ReferenceScores, ReferenceScoring
 from cvcdepth_ros.messages.cloud_sources import describe_left_out_clouds
 from cvcdepth_ros.recordings.replay import DepthReplay, RecordedImage, SurroundReplay
@@ -40,6 +43,8 @@ from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet
 Progress = Callable[[float], None]
 """Called with the share of the recording that is done."""
 
+_CONFIDENCE = "confidence_"  # before the names of its arrays
+_REFINED_BY_NS = 4 * NANOSECONDS  # of earlier sets, those that depth is refined with and one more second
 _LONGEST_STEP_NS = NANOSECONDS  # between two sets that are compared along the vehicle's way
 
 
@@ -70,24 +75,31 @@ class MeasuredSet:
         """The depth with the cameras' places."""
         return PosedDepth.from_rig(self.estimated.result, self.estimated.rig, self.world_T_base)
 
+    @property
+    def parts(self) -> list[PicturePart]:
+        """What of each camera's picture the depth shows."""
+        size = self.estimated.result.depth.shape[1:]
+        return [camera.network_part(*size) for camera in self.estimated.rig.cameras]
+
     def samples(self) -> list[DepthSamples]:
         """Return what is scored of each camera."""
         rig, depth = self.estimated.rig, self.estimated.result.depth
         views = {camera.name: camera.rectified_view for camera in rig.cameras}
         found = []
-        for name, truth, prediction in zip(rig.names, self.truth, depth, strict=True):
+        for name, truth, prediction, part in zip(rig.names, self.truth, depth, self.parts, strict=True):
             others = [views[other] for other in rig.neighbours[name]]
             overlap = overlap_pixels(truth, views[name], others)
-            found.append(DepthSamples(sample_prediction(prediction, truth), truth.depth, overlap, truth.parts))
+            sampled = sample_prediction(prediction, truth, part)
+            found.append(DepthSamples(sampled, truth.depth, overlap, truth.parts))
         return found
 
     def sky(self, far: float) -> tuple[int, int]:
         """Return the pixels with depth that show the sky, and those among them whose depth is beyond `far` metres."""
         pixels = seen = 0
-        for truth, prediction in zip(self.truth, self.estimated.result.depth, strict=True):
+        for truth, prediction, part in zip(self.truth, self.estimated.result.depth, self.parts, strict=True):
             rows, columns = truth.sky.T
-            depth = np.zeros(len(rows))
-            there = sample_prediction(prediction, SparseDepth(rows, columns, depth, truth.height, truth.width))
+            sky = SparseDepth(rows, columns, np.zeros(len(rows)), truth.height, truth.width)
+            there = sample_prediction(prediction, sky, part)
             pixels += int((~np.isnan(there)).sum())
             seen += int((there > far).sum())
         return pixels, seen
@@ -106,6 +118,8 @@ class RecordingScores:
     """[S] when each set was recorded, ns."""
     references: Mapping[str, ReferenceScores]
     """What looks at no picture, by `REFERENCES`; flat ground is missing where the ground is not below every camera."""
+    confidence: ConfidenceScores | None = None
+    """None where it was not computed."""
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Return everything as arrays that numpy stores without pickling."""
@@ -121,6 +135,8 @@ class RecordingScores:
         }
         text = np.frombuffer(json.dumps(described).encode(), dtype=np.uint8)
         arrays = {f"agreement_{name}": found.agreement.columns for name, found in self.references.items()}
+        if self.confidence is not None:
+            arrays |= {f"{_CONFIDENCE}{name}": found for name, found in self.confidence.to_arrays().items()}
         return {"described": text, "agreement": self.agreement.columns, "log_times": self.log_times, **arrays}
 
     @classmethod
@@ -141,7 +157,13 @@ class RecordingScores:
             AgreementTable(map(tuple, described["pairs"]), arrays["agreement"]),
             arrays["log_times"],
             references,
+            _confidence_from(arrays),
         )
+
+
+def _confidence_from(arrays: Mapping[str, NDArray[Any]]) -> ConfidenceScores | None:
+    found = {name.removeprefix(_CONFIDENCE): array for name, array in arrays.items() if name.startswith(_CONFIDENCE)}
+    return ConfidenceScores.from_arrays(found) if found else None
 
 
 class RecordingEvaluation:
@@ -152,7 +174,12 @@ class RecordingEvaluation:
         self.job = job
         self.replay = SurroundReplay(recorded, job.settings)
         self.truth = _truth(job, recorded)
-        self.depths = DepthReplay(self.replay, predictor or job.settings.build_predictor(self.replay.rig))
+        self.depths = DepthReplay(
+            self.replay,
+            predictor or job.settings.build_predictor(self.replay.rig),
+            settings=job.settings.replayed,
+            wants_confidence=job.settings.has_confidence,
+        )
 
     @property
     def window(self) -> tuple[int, int]:
@@ -195,7 +222,8 @@ class RecordingEvaluation:
         It is matched anew from shortly before it, by the rig and the network of this evaluation.
         """
         anew = RecordingEvaluation(self.job, self.replay.recorded, self.depths.estimator)
-        for measured in anew.sets(log_time - 2 * NANOSECONDS, log_time + NANOSECONDS, stamp_ns):
+        before = _REFINED_BY_NS if self.depths.refinement.is_active else 2 * NANOSECONDS
+        for measured in anew.sets(log_time - before, log_time + NANOSECONDS, stamp_ns):
             return measured
         raise RecordingError(f"{self.job.path}: no set at {stamp_ns} ns")
 
@@ -276,8 +304,10 @@ class _Scoring:
         self.references = references
         self._latencies = latencies
         self._scorer = SurroundScorer(job.name, cameras, job.settings.scores)
+        self._confidence = ConfidenceScorer(cameras, job.settings.min_depth, job.settings.max_depth)
         self._agreement = AgreementTable()
         self._earlier: tuple[int, PosedDepth] | None = None
+        self.poses = PoseScoring(job.settings.checkpoint_path)
         self._log_times = array("q")
         self.sets_with_truth = 0
         self.truth_points = 0
@@ -289,12 +319,15 @@ class _Scoring:
             samples = measured.samples()
             points = self._scorer.add(measured.stamp_ns, samples)
             self.references.add(measured.stamp_ns, samples, measured.truth)
+            self._confidence.add(measured.estimated.result, measured.truth, measured.parts)
         self.truth_points += points
         if self._job.settings.truth == "depth":
             self.sky += measured.sky(self._job.settings.max_depth)
         self.sets_with_truth += points > 0
         with self._latencies.measure("label-free"), torch.inference_mode():
             self._compare(measured)
+        with self._latencies.measure("pose network"):
+            self.poses.add(measured)
         self._log_times.append(measured.log_time)
 
     @property
@@ -306,7 +339,8 @@ class _Scoring:
         """Return what was found."""
         log_times = np.array(self._log_times, dtype=np.int64)
         scores, references = self._scorer.scores(), self.references.result()
-        return RecordingScores(self._job.name, summary, scores, self._agreement, log_times, references)
+        confidence = self._confidence.scores()
+        return RecordingScores(self._job.name, summary, scores, self._agreement, log_times, references, confidence)
 
     def _compare(self, measured: MeasuredSet) -> None:
         stamp, rig, posed = measured.stamp_ns, measured.estimated.rig, measured.posed
@@ -335,6 +369,7 @@ def _summary(evaluation: RecordingEvaluation, scoring: _Scoring) -> dict[str, An
         "clouds_of_cameras": list(truth.left_out),
         "why_no_lidar": describe_left_out_clouds(truth.left_out) if truth.left_out else "",
         "motion": truth.motion.topic if truth.motion else None,
+        "refinement": depths.refinement.summary(),
         "sets": {
             "scored": scoring.sets,
             "with_truth": scoring.sets_with_truth,
@@ -343,6 +378,8 @@ def _summary(evaluation: RecordingEvaluation, scoring: _Scoring) -> dict[str, An
             "refused": depths.refused.count,
         },
         "truth_points": scoring.truth_points,
+        "pose_network": scoring.poses.result(),
+        "why_no_pose_network": scoring.poses.problem or None,
         "sky": {"pixels": int(scoring.sky[0]), "far": int(scoring.sky[1])},
         "no_flat_ground": scoring.references.problem or None,
         "refused": depths.refused.reasons + replay.unreadable.reasons,

@@ -53,6 +53,7 @@ class ReferenceScoring:
         self._limits = (settings.min_depth, settings.max_depth)
         self._with_agreement = is_without_truth
         self._ground = self._ground_depth(job, rig, size)
+        self._parts = [camera.network_part(*size) for camera in rig.cameras]
         self._scorers = {name: SurroundScorer(job.name, rig.names, score_settings) for name in self._names()}
         self._tables = {name: AgreementTable() for name in self._scorers}
 
@@ -98,7 +99,7 @@ class ReferenceScoring:
 
     def _depth_at(self, name: str, camera: int, image: DepthSamples, truth: SparseDepth) -> NDArray[np.float64] | float:
         if name == GROUND and self._ground is not None:
-            return sample_prediction(self._ground[camera], truth)
+            return sample_prediction(self._ground[camera], truth, self._parts[camera])
         least, most = self._limits
         counted = image.truth[(image.truth > least) & (image.truth < most) & ~np.isnan(image.prediction)]
         return best_constant(counted) if name == BEST_CONSTANT else self._metres

@@ -15,8 +15,10 @@ from cvcdepth_core.errors import ConfigError, RecordingError
 from cvcdepth_core.files import nan_to_null
 from cvcdepth_core.networks.checkpoint import load_checkpoint
 from cvcdepth_core.scoring.comparison import Comparison, compare
+from cvcdepth_core.scoring.confidence_scores import ConfidenceScores
 from cvcdepth_core.scoring.consistency import AgreementTable, summarise_agreement
 from cvcdepth_core.scoring.scores import ALL, SCALINGS, EvaluationProtocol, Scaling, Score, Scores, Summary
+from cvcdepth_core.training.pose_network import PoseScore
 from cvcdepth_ros.evaluation.image_scores import (
     ImageScore,
     LabelFree,
@@ -28,6 +30,7 @@ from cvcdepth_ros.evaluation.image_scores import (
 )
 from cvcdepth_ros.evaluation.job import Dependencies, EvaluationJob
 from cvcdepth_ros.evaluation.measuring import RecordingScores
+from cvcdepth_ros.evaluation.pose_scores import joined_pose_score
 from cvcdepth_ros.evaluation.references import REFERENCES
 from cvcdepth_ros.evaluation.trained_on import SeenSets, seen_in_training, trained_parts
 
@@ -154,6 +157,17 @@ class EvaluationResult:
         by_scaling = {scaling: scores.summary("image", scaling).mean[ALL] for scaling in SCALINGS}
         return Reference(by_scaling, mean_label_free(label_free.values()))
 
+    @cached_property
+    def confidence(self) -> ConfidenceScores | None:
+        """How good confidence is; None where it was not computed."""
+        found = [recording.confidence for recording in self.recordings if recording.confidence is not None]
+        return ConfidenceScores.merged(found) if found else None
+
+    @property
+    def pose_score(self) -> PoseScore | None:
+        """The checkpoint's pose network beside recorded motion; None where one of the two is missing."""
+        return joined_pose_score(recording.summary for recording in self.recordings)
+
     @property
     def truth_points(self) -> int:
         """How many pixels have truth inside the depth limits."""
@@ -171,12 +185,19 @@ class EvaluationResult:
             "scores": {p: {s: self.summary(p, s).to_json() for s in SCALINGS} for p in PROTOCOLS},
             "scale_ratio": {p: nan_to_null(self.scores.scale_ratios(p)) for p in PROTOCOLS},
             "label_free": self._label_free(),
+            "confidence": self.confidence.to_json() if self.confidence else None,
+            "pose_network": self.pose_network(),
             "references": {name: reference.to_json() for name, reference in self.references.items()},
             "recordings": [recording.summary for recording in self.recordings],
             "trained_on": [seen._asdict() for seen in self.trained_on],
             "failed": [failure._asdict() for failure in self.failed],
             "rows": self.scores.to_json(),
         }
+
+    def pose_network(self) -> dict[str, Any] | None:
+        """Return `pose_score` for JSON."""
+        score = self.pose_score
+        return None if score is None else {**score._asdict(), "ratio": score.ratio}
 
     def _label_free(self) -> dict[str, Any]:
         pairs = [

@@ -24,6 +24,7 @@ from cvcdepth_ros.finetuning.judgement import camera_numbers, numbers_of
 from cvcdepth_ros.finetuning.run import FinetuneResult
 from cvcdepth_ros.installation import package_version
 from cvcdepth_ros.training_data.index import RecordingIndex
+from cvcdepth_ros.training_data.sample_choice import describe_motion
 
 CARD_FILE, CARD_TEXT_FILE = "model_card.json", "model_card.md"
 
@@ -86,10 +87,24 @@ def score_pairs(
     return [arrow.join(unknown if number is None else f"{number:.3f}" for number in pair) for pair in pairs]
 
 
+def pose_lines(scores: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what the pose networks before and after say, and an empty line; nothing where no motion is recorded."""
+    found = {when: (scores[when] or {}).get("pose_network") for when in ("before", "after")}
+    told = [
+        f"{one['ratio']:.2f} of the recorded way, {one['degrees']:.2f} degrees off, {when}"
+        for when, one in found.items()
+        if one
+    ]
+    if told:
+        yield f"The pose network tells {'; '.join(told)}."
+        yield ""
+
+
 def _scores(result: EvaluationResult | None) -> dict[str, Any] | None:
     if result is None:
         return None
-    return {"held_out": nan_to_null(numbers_of(result)), "cameras": camera_numbers(result)}
+    held_out, cameras = nan_to_null(numbers_of(result)), camera_numbers(result)
+    return {"held_out": held_out, "cameras": cameras, "pose_network": result.pose_network()}
 
 
 def _recording(result: FinetuneResult, number: int) -> dict[str, Any]:
@@ -108,6 +123,7 @@ def _recording(result: FinetuneResult, number: int) -> dict[str, Any]:
         "outside_of_recorded_motion": index.without_motion,
         "training_samples": result.samples[number],
         "held_out_sets": _scored_sets(result, str(index.path)),
+        "motion": describe_motion(index, result.job.config.recordings),
         "cameras": index.layout.names,
     }
 
@@ -168,15 +184,16 @@ def _score_lines(scores: Mapping[str, Any]) -> Iterator[str]:
     yield "Scale is the median of median(truth) / median(prediction), 1 where depth is metric; the photometric error"
     yield "needs no labels. A dash stands for what could not be measured."
     yield ""
+    yield from pose_lines(scores)
 
 
 def _data_lines(card: Mapping[str, Any]) -> Iterator[str]:
     yield "## Data"
     yield ""
-    yield "| recording | from | seconds | sets | training samples | held-out sets | cameras |"
-    yield "|---|---|---|---|---|---|---|"
+    yield "| recording | from | seconds | sets | training samples | held-out sets | motion | cameras |"
+    yield "|---|---|---|---|---|---|---|---|"
     for entry in card["data"]:
-        counts = (entry["sets"], entry["training_samples"], entry["held_out_sets"])
+        counts = (entry["sets"], entry["training_samples"], entry["held_out_sets"], entry["motion"])
         cells = (entry["recording"], entry["from"], f"{entry['seconds']:.1f}", *counts, ", ".join(entry["cameras"]))
         yield f"| {' | '.join(_plain(cell) for cell in cells)} |"
     yield ""

@@ -100,6 +100,8 @@ def numbers_of(result: EvaluationResult) -> dict[str, float]:
         name: mean([v for image in result.images if not math.isnan(v := getattr(image.label_free, name))])
         for name in ("spatial", "temporal", "spatial_photometric", "temporal_photometric")
     }
+    if (pose := result.pose_score) is not None:
+        found |= {"pose_ratio": pose.ratio, "pose_degrees": pose.degrees}
     return {name: value for name, value in found.items() if not math.isnan(value)}
 
 

@@ -15,16 +15,20 @@ from pathlib import Path
 from cvcdepth_core.errors import CvcDepthError, RecordingError
 from cvcdepth_core.files import write_atomically
 from cvcdepth_core.rig.rig_file import RigLayout
+from cvcdepth_core.training.config import MotionSource
 from cvcdepth_ros.bags import Location, file_identities, open_recording
 from cvcdepth_ros.checks import CheckContext, CheckOptions, CheckResult, NumberedResult, run_checks
 from cvcdepth_ros.installation import package_version
 from cvcdepth_ros.kept import Arrays, KeptResults, document_array, read_document
 from cvcdepth_ros.settings import MatchingSettings
-from cvcdepth_ros.training_data.index import RecordingIndex, load_index
+from cvcdepth_ros.training_data.index import RecordingIndex, ScaleSource, load_index
 from cvcdepth_ros.training_data.own_body_masks import find_self_occlusion, save_masks
 
 NOT_NEEDED: Collection[str] = ("stamps", "LiDAR")
 """Checks whose failure does not spoil a training: the check of sets tells what odd stamps cost."""
+
+COUNTED_HERE: Collection[str] = ("training", "pose network")
+"""Checks of what a run finds out by itself, from the very recordings that are left."""
 
 _CHECKS_FOLDER, _INDEX_FOLDER, _MASKS_FOLDER, _FOUND_FILE = "checks", "index", "masks", "found.json"
 
@@ -44,6 +48,13 @@ class Source:
     """Topics of the LiDARs; none: the vehicle has none; None: those of each recording."""
     base_frame: str = "base_link"
     """The vehicle's frame, where `layout` is None."""
+    motion: MotionSource = "network"
+    """`recordings.motion` of the configuration."""
+
+    @property
+    def scale_from(self) -> ScaleSource:
+        """What the scale is learnt from."""
+        return "overlaps" if self.motion == "network" else "overlaps or motion"
 
 
 @dataclass
@@ -68,7 +79,9 @@ def prepare(source: Source, run: Path) -> Prepared:
             checks = check_results(path, source, run)
             problems = [found for found in checks if found.result.status in ("failed", "warning")]
             _refuse(path, problems)
-            index = load_index(path, run / _INDEX_FOLDER, source.matching, source.layout, source.base_frame)
+            index = load_index(
+                path, run / _INDEX_FOLDER, source.matching, source.layout, source.base_frame, source.scale_from
+            )
             prepared.indexes.append(index)
             prepared.warnings += [_describe_finding(path, problem) for problem in problems]
             prepared.warnings += [f"{path}: {loss}" for loss in index.losses]
@@ -90,14 +103,14 @@ def check_results(path: Location, source: Source, run: Path) -> list[NumberedRes
     work = {
         "version": package_version(),
         "files": file_identities(path),
-        "options": asdict(options),
+        "options": {name: value for name, value in asdict(options).items() if name not in ("training", "checkpoint")},
         "skipped": sorted(source.skipped_checks),
         "rig": None if layout is None else layout.model_dump(mode="json"),
     }
 
     def run_all() -> list[NumberedResult]:
         with open_recording(path) as recording:
-            return run_checks(CheckContext(recording, options, layout), source.skipped_checks)
+            return run_checks(CheckContext(recording, options, layout), {*source.skipped_checks, *COUNTED_HERE})
 
     kept = KeptResults(run / _CHECKS_FOLDER, _checks_to_arrays, _checks_from_arrays)
     return kept.load_or_make(str(path), work, run_all)

@@ -8,12 +8,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from cvcdepth_core.engines import resolve_device
-from cvcdepth_core.errors import CheckpointError
+from cvcdepth_core.errors import CheckpointError, RecordingError
 from cvcdepth_core.files import write_atomically
 from cvcdepth_core.networks.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from cvcdepth_core.training.config import TrainingConfig
+from cvcdepth_core.training.config import RecordingsConfig, TrainingConfig
 from cvcdepth_core.training.distributed import Processes, own_device
 from cvcdepth_core.training.model import SurroundModel
+from cvcdepth_core.training.pose_network import TRUSTED_RATIOS
 from cvcdepth_core.training.run_folder import CHECKPOINT_FILE
 from cvcdepth_core.training.starting_model import build_surround_model
 from cvcdepth_core.training.trainer import RunObserver, Trainer
@@ -27,7 +28,7 @@ from cvcdepth_ros.finetuning.tensorboard import TensorBoardObserver, has_tensorb
 from cvcdepth_ros.finetuning.validation import CANDIDATE_FILE, HeldOutValidation
 from cvcdepth_ros.installation import package_version
 from cvcdepth_ros.training_data.loader import RecordingBatches
-from cvcdepth_ros.training_data.sample_choice import describe_skipped_samples
+from cvcdepth_ros.training_data.sample_choice import describe_skipped_samples, describe_unprovable, held_out_sets
 
 START_FILE, BEST_FILE = "start.safetensors", "best.safetensors"
 
@@ -47,6 +48,8 @@ class FinetuneJob:
     """Weights to start from; None: random ones."""
     device: str = "auto"
     quiet: bool = False
+    with_promotion: bool = True
+    """Whether `best.safetensors` is wanted: then a run is refused that could not prove its weights to be better."""
 
     @property
     def started_from(self) -> str:
@@ -84,6 +87,8 @@ def fine_tune(job: FinetuneJob, processes: Processes, warn: Callable[[str], None
     if processes.is_first:
         _warn_of_losses(prepared, job, warn)
     batches = RecordingBatches(prepared.indexes, job.config, processes)
+    if job.with_promotion:
+        _refuse_unprovable(prepared, job.config.recordings)
     model = build_surround_model(job.config, job.start)
     device = own_device(resolve_device(job.device))
     parts = []
@@ -96,6 +101,8 @@ def fine_tune(job: FinetuneJob, processes: Processes, warn: Callable[[str], None
     if processes.is_first and trainer.progress.step == 0:
         _forget_former_run(job.run)
     before = _evaluated(job, parts, job.run / START_FILE, "before") if parts else None
+    if before is not None:
+        _warn_of_pose_network(before, "the start's", prepared, warn)
     try:
         trainer.train(quiet=job.quiet)
     finally:
@@ -104,7 +111,9 @@ def fine_tune(job: FinetuneJob, processes: Processes, warn: Callable[[str], None
     if not processes.is_first:
         return None
     weights, after, verdict = _judged(job, parts, before)
-    samples = [sum(sample.recording == i for sample in batches.reader.samples) for i in range(len(prepared.indexes))]
+    if after is not None:
+        _warn_of_pose_network(after, "the trained", prepared, warn)
+    samples = [sum(sample.recording == i for sample in batches.targets) for i in range(len(prepared.indexes))]
     return FinetuneResult(job, prepared, trainer, samples, parts, weights, before, after, verdict)
 
 
@@ -113,8 +122,34 @@ def _warn_of_losses(prepared: Prepared, job: FinetuneJob, warn: Callable[[str], 
     for index in prepared.indexes:
         if told := describe_skipped_samples(index, job.config.recordings):
             prepared.warnings.append(f"{index.path}: {told}")
+        if job.config.recordings.motion == "auto" and index.poses is None:
+            prepared.warnings.append(f"{index.path}: no motion is recorded, so the pose network's is taken")
     for text in (*(f"left out: {reason}" for reason in prepared.left_out.values()), *prepared.warnings):
         warn(text)
+
+
+def _refuse_unprovable(prepared: Prepared, config: RecordingsConfig) -> None:
+    """Raise RecordingError, with the counts, where the held-out parts are too small for any verdict."""
+    counts = {str(index.path): held_out_sets(index, config) for index in prepared.indexes}
+    if told := describe_unprovable(sum(counts.values())):
+        by_recording = ", ".join(f"{count} of {path}" for path, count in counts.items())
+        raise RecordingError(
+            f"{told} ({by_recording}; recordings.held_out is {config.held_out:g}): take longer or more recordings, "
+            "hold more out, or train without a verdict, by --no-promotion"
+        )
+
+
+def _warn_of_pose_network(
+    scored: EvaluationResult, whose: str, prepared: Prepared, warn: Callable[[str], None]
+) -> None:
+    """Warn of a pose network that the recorded motion contradicts, and keep the warning for the report."""
+    score = scored.pose_score
+    if score is None or score.is_trusted:
+        return
+    least, greatest = TRUSTED_RATIOS
+    text = f"{whose} pose network tells {score.describe()}; {least} to {greatest} of the way is right"
+    prepared.warnings.append(text)
+    warn(text)
 
 
 def _trainer(
@@ -187,6 +222,8 @@ def _judged(
     weights = candidate if candidate.exists() else run / CHECKPOINT_FILE
     after = _evaluated(job, parts, weights, "after")
     verdict = judge(before, after)
+    if not job.with_promotion:
+        return weights, after, replace(verdict, promoted=False, reason=f"no promotion is wanted; {verdict.reason}")
     if verdict.promoted:
         write_atomically(best, weights.read_bytes())
         return best, after, verdict

@@ -34,8 +34,10 @@ def training_pictures(batch: RigBatch, prediction: Prediction, config: Objective
         "input": _side_by_side(_colours(batch.images[0])),
         "depth": _side_by_side(DepthScale().colours(depth)),
         "from_before": _side_by_side(_colours(views.temporal[0, 0] * views.temporal_masks[0, 0])),
-        "from_neighbours": _side_by_side(_colours(views.overlap.images[0, 0] * (views.overlap.masks[0, 0] > 0))),
     }
+    if views.overlap.parts:
+        seen = views.overlap.images[0, 0] * (views.overlap.masks[0, 0] > 0)
+        pictures["from_neighbours"] = _side_by_side(_colours(seen))
     for name, (error, mask) in errors.items():
         shown, seen = (part[:, 0] if part.ndim == 6 else part for part in (error, mask))
         scaled = shown / prediction.depth if name == "depth_consistency" else shown

@@ -78,8 +78,8 @@ class CameraWatch:
         self._received: float | None = None
         self._changed = 0.0
         self._repeats = 0
-        self._refusal = ""
-        self._matched, self._matched_at = 0, 0.0
+        self._refusal, self._refused_at = "", -math.inf
+        self._matched, self._matched_at, self._joined_at = 0, 0.0, -math.inf
         self._listening_since = -math.inf
         self._lock = threading.Lock()
         self.refused = 0
@@ -109,7 +109,9 @@ class CameraWatch:
         """Note the outcome of an image: why it could not be used, or an empty string when it could."""
         with self._lock:
             self._refusal = refusal
-            self.refused += bool(refusal)
+            if refusal:
+                self.refused += 1
+                self._refused_at = self._clock()
 
     def resume_listening(self) -> None:
         """Count silence from now on: images could not be received until now."""
@@ -132,7 +134,7 @@ class CameraWatch:
         """Return what is wrong with its images, their absence included."""
         with self._lock:
             found: list[Trouble] = []
-            if self._refusal:
+            if self._refusal and not self._is_refusal_outlived():
                 found.append((CameraState.REJECTED, self._refusal))
             if self._received is None:
                 return [*found, (CameraState.WAITING_FOR_IMAGES, "no image yet")]
@@ -149,12 +151,18 @@ class CameraWatch:
         To be asked regularly; `is_explained` when there is another reason for it, which ends at that moment.
         """
         with self._lock:
+            if matched != self._matched:
+                self._joined_at = self._clock()
             if self._received is None or matched != self._matched or is_explained:
                 self._matched, self._matched_at = matched, self._clock()
-            patience = max(_UNMATCHED_SECONDS, _UNMATCHED_INTERVALS * self._interval())
-            if (self._received or 0.0) - self._matched_at > patience:
+            if (self._received or 0.0) - self._matched_at > self._matching_patience():
                 return [(CameraState.UNMATCHED, "its images come, but their stamps fit no set")]
             return []
+
+    def _is_refusal_outlived(self) -> bool:
+        """Say whether images have come for long that fit no set: those are neither used nor refused."""
+        judged = max(self._refused_at, self._joined_at)
+        return self._received is not None and self._received - judged > self._matching_patience()
 
     def _is_frozen(self) -> bool:
         if not self._frozen_after or self._received is None or self._repeats < _REPEATS_OF_A_FROZEN_CAMERA:
@@ -163,6 +171,9 @@ class CameraWatch:
 
     def _patience(self, seconds: float) -> float:
         return max(seconds, _SLOW_CAMERA_INTERVALS * self._interval())
+
+    def _matching_patience(self) -> float:
+        return max(_UNMATCHED_SECONDS, _UNMATCHED_INTERVALS * self._interval())
 
     def _interval(self) -> float:
         return statistics.median(self._intervals) if self._intervals else 0.0

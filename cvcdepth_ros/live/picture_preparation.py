@@ -10,12 +10,11 @@ import threading
 import time
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any
 
 from cvcdepth_core.errors import ImageError
 from cvcdepth_core.images.rectifier import Rectifier
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
-from cvcdepth_ros.surround_sets.set_estimation import Outcome, picture_or_error
+from cvcdepth_ros.surround_sets.set_estimation import EncodedImage, Outcome, picture_or_error
 
 _MOST_THREADS = 4
 
@@ -23,11 +22,11 @@ _MOST_THREADS = 4
 class CameraImage:
     """One image message on its way to the network's picture, which is made once, by the first who asks."""
 
-    def __init__(self, camera: str, message: Any, latencies: StageLatencies) -> None:
-        """Take the message over; it is let go as soon as the picture is there."""
+    def __init__(self, camera: str, image: EncodedImage, latencies: StageLatencies) -> None:
+        """Take the image over; it is let go as soon as the picture is there."""
         self.camera = camera
         self.received = time.monotonic()
-        self._message = message
+        self._image: EncodedImage | None = image
         self._latencies = latencies
         self._rectifier: Rectifier | None = None
         self._picture: Outcome | None = None
@@ -36,10 +35,10 @@ class CameraImage:
     def picture(self, rectifier: Rectifier) -> Outcome:
         """Return the picture, or an error when it is damaged or was made with maps of another calibration."""
         with self._lock:
-            if self._picture is None:
-                self._picture = picture_or_error(self._message, self.camera, rectifier, self._latencies)
-                self._rectifier, self._message = rectifier, None
-        if self._rectifier is not rectifier:
+            if self._picture is None and self._image is not None:
+                self._picture = picture_or_error(self._image, self.camera, rectifier, self._latencies)
+                self._rectifier, self._image = rectifier, None
+        if self._picture is None or self._rectifier is not rectifier:
             return ImageError(f"camera {self.camera}: its calibration changed while its image waited")
         return self._picture
 

@@ -4,14 +4,14 @@
     receive (caller) -> decode and rectify (pool) -> estimate (one thread, newest set wins) -> publish (one thread)
 
 Nothing piles up: of each camera one image waits to be decoded, one set to be estimated, one estimate to be published.
-What nobody wants is not computed.
+What nobody wants is not computed, but for packets of video, which are all decoded beside that (`video_streams`).
 """
 
 import queue
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, wait
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -26,9 +26,11 @@ from cvcdepth_core.rig.rig import Rig
 from cvcdepth_ros.live.camera_states import CameraWatch
 from cvcdepth_ros.live.mailbox import Mailbox
 from cvcdepth_ros.live.picture_preparation import CameraImage, PicturePreparer
-from cvcdepth_ros.messages.conversion import stamp_ns
+from cvcdepth_ros.live.video_streams import VideoImage, VideoStreams
+from cvcdepth_ros.messages.conversion import is_video_packet, stamp_ns
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
-from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet, usable_pictures
+from cvcdepth_ros.surround_sets.refinement import RefinementStage
+from cvcdepth_ros.surround_sets.set_estimation import EncodedImage, EstimatedSet, usable_pictures
 from cvcdepth_ros.surround_sets.synchronizer import SurroundSet, SurroundSynchronizer
 
 _JOIN_SECONDS = 1.0
@@ -57,6 +59,7 @@ class SurroundPipeline:
         publish: Callable[[EstimatedSet[CameraImage]], None],
         observe: Callable[[EstimatedSet[CameraImage]], None],
         latencies: StageLatencies,
+        refinement: RefinementStage,
     ) -> None:
         """Start the threads.
 
@@ -71,6 +74,7 @@ class SurroundPipeline:
         self._publish = publish
         self._observe = observe
         self._latencies = latencies
+        self._refinement = refinement
         self._rig: Rig | None = None
         self._build: Future[_Build] | None = None
         self._builds: list[Future[_Build]] = []
@@ -78,6 +82,7 @@ class SurroundPipeline:
         self._pace = _InferencePace()
         self._warming = threading.Lock()
         self._warm: DepthPredictor | None = None
+        self._videos = VideoStreams()
         self._preparer = PicturePreparer(len(watches))
         self._estimates: queue.Queue[EstimatedSet[CameraImage] | None] = queue.Queue(maxsize=1)
         self.problem = ""
@@ -120,19 +125,34 @@ class SurroundPipeline:
             self._use(built)
         self._estimator = estimator
 
-    def add(self, camera: str, message: Any) -> None:
-        """Take an image message in; quick, for whoever receives them all."""
-        stamp = stamp_ns(message)
-        if not self._watches[camera].accept(stamp, message.data):
-            return
-        image = CameraImage(camera, message, self._latencies)
-        self._prepare_ahead(image)
-        for surround_set in self._synchroniser.add(camera, stamp, image):
+    def add(self, cameras: Sequence[str], message: Any) -> None:
+        """Take an image message or a packet of video in, of a camera or of all that are views of one lens; quick."""
+        stamp, content = stamp_ns(message), message.data
+        if is_video_packet(message):
+            message = self._video_image(cameras, message)  # whatever becomes of it, later packets are built on it
+        image = EncodedImage(message, is_shared=len(cameras) > 1)
+        for camera in cameras:
+            if self._watches[camera].accept(stamp, content) and message is not None:
+                self._add(CameraImage(camera, image, self._latencies), stamp)
+
+    def _add(self, image: CameraImage, stamp: int) -> None:
+        self._prepare_ahead([image])
+        for surround_set in self._synchroniser.add(image.camera, stamp, image):
             self._mailbox.put(surround_set)
+            self._prepare_ahead(surround_set.images.values())
+
+    def _video_image(self, cameras: Sequence[str], packet: Any) -> VideoImage | None:
+        try:
+            return self._videos.take(cameras[0], packet)
+        except ImageError as error:
+            for camera in cameras:
+                self._watches[camera].used(str(error))
+            return None
 
     def close(self) -> bool:
         """Stop; False when a thread is still inside its last set a second later."""
         self._mailbox.close()
+        self._videos.close()
         self._preparer.close()
         deadline = time.monotonic() + _JOIN_SECONDS
         for thread in self._threads:
@@ -147,15 +167,21 @@ class SurroundPipeline:
         if former is not None:
             former.cancel()  # whoever sends new calibrations faster than maps can be built piles nothing up
 
-    def _prepare_ahead(self, image: CameraImage) -> None:
+    def _prepare_ahead(self, images: Iterable[CameraImage]) -> None:
+        """Have pictures made while the network works on another set.
+
+        An image whose set will be replaced before the network is free need not be decoded. When it arrives, that is
+        not known yet; when its set is complete, what comes next is a camera's interval away.
+        """
         build = self._build
         surround = _surround_of(build) if build is not None and build.done() else None
-        if surround is None or not self._needed([image.camera], surround):
+        if surround is None:
             return
-        rectifier = surround.preprocessor.rectifiers.get(image.camera)
-        # An image whose set will be replaced before the network is free need not be decoded.
-        if rectifier is not None and self._pace.is_free_within(self._watches[image.camera].interval):
-            self._preparer.prepare(image, rectifier)
+        rectifiers = surround.preprocessor.rectifiers
+        soon = {i.camera: i for i in images if self._pace.is_free_within(self._watches[i.camera].interval)}
+        for camera in self._needed(soon, surround):
+            if camera in rectifiers:
+                self._preparer.prepare(soon[camera], rectifiers[camera])
 
     def _build_and_warm_up(self, rig: Rig, estimator: DepthPredictor) -> _Build:
         build = self._build_surround(rig, estimator)
@@ -226,17 +252,19 @@ class SurroundPipeline:
         self._latencies.record("wait for set", max(received) - min(received))
         self._latencies.record("wait for inference", time.monotonic() - max(received))
         pictures = self._pictures(needed, rectifiers, len(images))
-        with self._latencies.measure("inference"), self._pace.measured():
-            result = surround.estimate([pictures.get(name) for name in rectifiers])
-        self._estimates.put(EstimatedSet(surround_set, surround.rig, result))
+        with self._pace.measured():
+            with self._latencies.measure("inference"):
+                result = surround.estimate([pictures.get(name) for name in rectifiers])
+            estimated = self._refinement.finished(surround, surround_set, result)
+        self._estimates.put(estimated)
 
     def _needed(self, cameras: Iterable[str], surround: SurroundDepthEstimator) -> list[str]:
         """Return which of the cameras' pictures the network needs for the depth that is wanted.
 
-        One that looks at all cameras together must see them all for any: whoever subscribes to one camera gets what
-        whoever subscribes to all gets.
+        One that looks at all cameras together must see them all for any, and so must refinement: whoever subscribes to
+        one camera gets what whoever subscribes to all gets.
         """
-        if surround.estimator.independent:
+        if surround.estimator.independent and not self._refinement.is_active:
             return [name for name in cameras if self._wanted(name)]
         return list(cameras) if any(map(self._wanted, self._watches)) else []
 

@@ -22,7 +22,7 @@ IMAGE_TYPES = (IMAGE_TYPE, COMPRESSED_IMAGE_TYPE)
 """Messages that hold one picture each, best first."""
 VIDEO_TYPES = ("ffmpeg_image_transport_msgs/msg/FFMPEGPacket", "foxglove_msgs/msg/CompressedVideo")
 RECORDED_IMAGE_TYPES = (*IMAGE_TYPES, *VIDEO_TYPES)
-"""What of a recording is decoded, best first: a video stream from its key frames on."""
+"""What is decoded, best first: a video stream from its key frames on."""
 
 _INFO = "camera_info"
 # Image transports whose topics lie below the picture's.
@@ -92,7 +92,7 @@ def discover_cameras(topic_types: Mapping[str, str]) -> list[CameraEntry]:
 
     See `find_cameras`.
     """
-    return find_cameras(topic_types).cameras
+    return find_cameras(topic_types, image_types=RECORDED_IMAGE_TYPES).cameras
 
 
 def find_cameras(

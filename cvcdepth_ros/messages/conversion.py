@@ -9,7 +9,8 @@ import array
 import sys
 from collections.abc import Callable
 from importlib import import_module
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,9 +28,26 @@ _BIG_ENDIAN_HOST = sys.byteorder == "big"
 
 
 def stamp_ns(message: Any) -> int:
-    """Return the stamp of a message with a header, in nanoseconds since the epoch."""
-    stamp = message.header.stamp
+    """Return the stamp of a message with a header, or of a video packet, in nanoseconds since the epoch."""
+    stamp = header_of(message).stamp
     return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
+
+
+def header_of(message: Any) -> Any:
+    """Return a message's header, or what stands for it in a `foxglove_msgs/CompressedVideo`."""
+    if hasattr(message, "header"):
+        return message.header
+    return SimpleNamespace(stamp=message.timestamp, frame_id=message.frame_id)
+
+
+def is_video_packet(message: Any) -> bool:
+    """Whether a message is one packet of a video stream, of the types in `VIDEO_TYPES`."""
+    return hasattr(message, "pts") or hasattr(message, "timestamp")
+
+
+def video_codec(packet: Any) -> str:
+    """Return what a video packet says of its codec."""
+    return str(packet.encoding if hasattr(packet, "encoding") else packet.format)
 
 
 def picture_from_message(
@@ -56,6 +74,13 @@ def calibration_from_message(message: Any, camera: str) -> Calibration:
     return read_camera_info(message, camera).calibration
 
 
+class Covariances(NamedTuple):
+    """Of an odometry message, each [6, 6]: along and about x, y and z."""
+
+    pose: NDArray[np.float64]
+    twist: NDArray[np.float64]
+
+
 class MessageFactory:
     """Builds messages from arrays, with the message classes of one library."""
 
@@ -74,6 +99,10 @@ class MessageFactory:
         if encoding != "32FC1":
             raise ConfigError(f"depth encoding '{encoding}' is not one of 32FC1, 16UC1")
         return self._image(stamp, frame_id, depth, encoding)
+
+    def confidence_image(self, stamp: int, frame_id: str, confidence: NDArray[np.float32]) -> Any:
+        """Build the 32FC1 image of `confidence` [H, W] in [0, 1]."""
+        return self._image(stamp, frame_id, confidence, "32FC1")
 
     def colour_image(self, stamp: int, frame_id: str, picture: Picture) -> Any:
         """Build the rgb8 image of `picture` [H, W, 3]."""
@@ -112,6 +141,31 @@ class MessageFactory:
             row_step=point_step * width,
             data=self._bytes(cloud),
             is_dense=cloud.ndim == 2,
+        )
+
+    def odometry(
+        self, stamp: int, frame_id: str, base_frame: str, pose: Pose, twist: NDArray[np.float64], errors: Covariances
+    ) -> Any:
+        """Build the Odometry of `base_frame` at `pose` in `frame_id`; `twist` [6] is in the base frame (m/s, rad/s)."""
+        where, velocity = self._transform(pose), twist.tolist()
+        vector = self._class("geometry_msgs/msg/Vector3")
+        point = self._class("geometry_msgs/msg/Point")(
+            x=where.translation.x, y=where.translation.y, z=where.translation.z
+        )
+        return self._class("nav_msgs/msg/Odometry")(
+            header=self._header(stamp, frame_id),
+            child_frame_id=base_frame,
+            pose=self._class("geometry_msgs/msg/PoseWithCovariance")(
+                pose=self._class("geometry_msgs/msg/Pose")(position=point, orientation=where.rotation),
+                covariance=errors.pose.ravel(),
+            ),
+            twist=self._class("geometry_msgs/msg/TwistWithCovariance")(
+                twist=self._class("geometry_msgs/msg/Twist")(
+                    linear=vector(**dict(zip("xyz", velocity[:3], strict=True))),
+                    angular=vector(**dict(zip("xyz", velocity[3:], strict=True))),
+                ),
+                covariance=errors.twist.ravel(),
+            ),
         )
 
     def string(self, content: str) -> Any:

@@ -2,17 +2,20 @@
 """Complete a rig file with what a recording or a live system says: CameraInfo and static transforms."""
 
 from collections.abc import Collection
-from typing import Any
+from typing import Any, TypeVar
 
 from cvcdepth_core.errors import RigError, TransformError
 from cvcdepth_core.rig.calibration import Calibration
 from cvcdepth_core.rig.poses import Pose
 from cvcdepth_core.rig.rig import Camera, Rig, order_around_vehicle
 from cvcdepth_core.rig.rig_file import CameraEntry, PoseEntry, RigLayout
+from cvcdepth_core.rig.wide_lenses import wide_lenses, with_views
 from cvcdepth_ros.messages.calibration_changes import describe_change
 from cvcdepth_ros.messages.camera_info import is_uncalibrated, read_camera_info
 from cvcdepth_ros.messages.conversion import stamp_ns
 from cvcdepth_ros.messages.transforms import TransformTree
+
+T = TypeVar("T")
 
 _MOST_CHANGES = 100  # a lens that zooms or focuses changes for ever
 _LATE = "the first ones cannot be used (drivers send zeros until they have read their file), the later ones are"
@@ -60,6 +63,11 @@ class RigAssembler:
         is_recalibrated = entry.calibration is None and self._add_calibration(camera, message)
         return is_renamed or is_recalibrated
 
+    def add_camera_info_on(self, topic: str, message: Any) -> bool:
+        """Add a CameraInfo to every camera of that topic; return whether it changes anything."""
+        cameras = [camera.name for camera in self.layout.cameras if camera.camera_info_topic == topic]
+        return True in [self.add_camera_info(camera, message) for camera in cameras]
+
     def _add_calibration(self, camera: str, message: Any) -> bool:
         try:
             calibration, notes = read_camera_info(message, camera)
@@ -82,8 +90,35 @@ class RigAssembler:
         return known != calibration
 
     def frame_id(self, camera: str) -> str | None:
-        """Return the camera's optical frame: the rig file's, else CameraInfo's, None while neither is known."""
+        """Return the camera's optical frame: the rig file's, else CameraInfo's, None while neither is known.
+
+        Of a view that is a lens's, whichever way the view looks.
+        """
         return self._entry(camera).frame_id or self._frame_ids.get(camera)
+
+    def view_frame_id(self, camera: str) -> str | None:
+        """Return the frame of what is computed for the camera: its own where its view is turned, else `frame_id`."""
+        return f"{camera}_optical_frame" if self._entry(camera).is_turned else self.frame_id(camera)
+
+    def view_poses(self) -> dict[str, Pose]:
+        """Return the poses of the turned views' frames, as far as they are known: nobody else publishes them."""
+        turned = [entry.name for entry in self.layout.cameras if entry.is_turned]
+        complete = [name for name in turned if self._problem(name) is None]
+        cameras = self.rig(complete).cameras if complete else ()
+        return {f"{camera.name}_optical_frame": camera.base_T_camera for camera in cameras}
+
+    def split_wide_lenses(self) -> None:
+        """Put two or three views in the place of each camera whose lens one picture cannot show, see `wide_lenses`.
+
+        Those of which a view is chosen already stay as they are, and those without a calibration.
+        """
+        known = {name: found for name in self.layout.names if (found := self.calibration(name)) is not None}
+        wide = wide_lenses(self.layout, known)
+        former, self.layout = self.layout, with_views(self.layout, wide)
+        views, former_views = self.layout.views_by_image, former.views_by_image
+        for topic, (name, *_) in former_views.items():
+            if name in wide:
+                self._take_over(name, views[topic])
 
     def problems(self) -> dict[str, str]:
         """Say for each camera that is not complete what it lacks; empty when the rig can be built."""
@@ -145,8 +180,9 @@ class RigAssembler:
             self._entry(camera.name).model_copy(
                 update={
                     "frame_id": self.frame_id(camera.name),
-                    "calibration": camera.calibration,
-                    "base_T_camera": PoseEntry.from_matrix(camera.base_T_camera),
+                    # The lens's, of which a view is taken, not the view's.
+                    "calibration": self.calibration(camera.name),
+                    "base_T_camera": PoseEntry.from_matrix(self.pose(camera.name)),
                 }
             )
             for camera in self._around_vehicle()
@@ -157,6 +193,16 @@ class RigAssembler:
         cameras = {camera.name: camera for camera in self.rig().cameras}
         order = order_around_vehicle({name: camera.base_T_camera for name, camera in cameras.items()})
         return [cameras[name] for name in order]
+
+    def _take_over(self, camera: str, views: Collection[str]) -> None:
+        """Let what is known of a camera hold for the views of its lens."""
+        _share(self._calibrations, camera, views)
+        _share(self._frame_ids, camera, views)
+        _share(self._refused, camera, views)
+        _share(self._stamps, camera, views)
+        _share(self._notes, camera, views)
+        if camera in self._late:
+            self._late |= {*views}
 
     def _layout_of(self, names: Collection[str]) -> RigLayout:
         """Leave the other cameras out; the first camera stands in for the anchor."""
@@ -169,3 +215,9 @@ class RigAssembler:
 
     def _problem(self, camera: str) -> str | None:
         return self.calibration_problem(camera) or self.transform_problem(camera)
+
+
+def _share(known: dict[str, T], camera: str, views: Collection[str]) -> None:
+    """Give what is known of a camera to the views of its lens."""
+    if camera in known:
+        known.update(dict.fromkeys(views, known.pop(camera)))

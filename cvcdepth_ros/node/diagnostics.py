@@ -11,12 +11,20 @@ from cvcdepth_core.estimator import DepthEstimator
 from cvcdepth_core.rig_health.overlap_monitor import OverlapMonitor
 from cvcdepth_ros.live.camera_states import CameraCondition, CameraState, CameraWatch
 from cvcdepth_ros.live.mailbox import MailboxStatistics
+from cvcdepth_ros.live.vehicle_poses import VehiclePoses
 from cvcdepth_ros.surround_sets.latencies import StageSummary
+from cvcdepth_ros.surround_sets.refinement import RefinementStage
 from cvcdepth_ros.surround_sets.synchronizer import CameraStatistics, SynchronizerStatistics
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
 UNKNOWN_LATENCY = "not known: images are not stamped in the node's time"
+
+_EVIDENCE = {
+    "odometry": "earlier pictures by odometry, and neighbours",
+    "alignment": "earlier pictures by motion from the pictures, and neighbours",
+    "unknown": "neighbours only",
+}
 
 _LEVELS = {
     CameraState.OK: OK,
@@ -101,6 +109,21 @@ def overlap_status(monitor: OverlapMonitor) -> DiagnosticStatus:
     values |= {f"{camera}: sharper by (log)": change for camera, change in monitor.sharpness_changes().items()}
     findings = "; ".join(map(str, monitor.findings()))
     return status(WARN if findings else OK, "cross-view consistency", findings or "ok", values)
+
+
+def refinement_status(stage: RefinementStage, motion: VehiclePoses) -> DiagnosticStatus:
+    """Return where motion comes from, and with how many pictures each camera's was compared in the last set."""
+    last = stage.last
+    if last is None:
+        return status(OK, "refinement", "no set yet", {"motion topic": motion.topic or "none"})
+    values: dict[str, Any] = {"motion": last.source, "motion topic": motion.topic or "none"}
+    found = last.depth
+    for name, share, earlier, beside in zip(stage.cameras, found.checked, found.earlier, found.beside, strict=True):
+        values[f"{name}: checked share"] = float(share)
+        values[f"{name}: earlier pictures"] = int(earlier)
+        values[f"{name}: neighbours"] = int(beside)
+    problem = last.odometry_problem or motion.problem
+    return status(WARN if problem else OK, "refinement", problem or _EVIDENCE[last.source], values)
 
 
 def _text(value: Any) -> str:

@@ -12,7 +12,7 @@ from sensor_msgs.msg import CameraInfo
 
 from cvcdepth_core.errors import CvcDepthError
 from cvcdepth_core.rig.rig_file import CameraEntry, RigLayout
-from cvcdepth_ros.messages.camera_discovery import COMPRESSED_IMAGE_TYPE, IMAGE_TYPE, discover_cameras
+from cvcdepth_ros.messages.camera_discovery import RECORDED_IMAGE_TYPES, discover_cameras
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
 from cvcdepth_ros.messages.transforms import TransformTree
 from cvcdepth_ros.node.subscriptions import StaticTransformInput, topic_types
@@ -53,6 +53,7 @@ class LiveRigDiscovery:
         if not settled or self._assembler is None or self._assembler.problems():
             return None
         try:
+            self._assembler.split_wide_lenses()
             self._assembler.order_around_vehicle()
         except CvcDepthError as error:  # cameras that are each complete but together no rig
             self.refuse(str(error))
@@ -76,7 +77,7 @@ class LiveRigDiscovery:
         first, *others = problems.values()
         more = f" (and so for {len(others)} more of {len(self._entries)} cameras)" if others else ""
         is_pose = self._assembler is not None and self._assembler.calibration_problem(next(iter(problems))) is None
-        remedy = f"; publish it on /tf_static, base_frame is {self._base_frame}" if is_pose else ""
+        remedy = f"; publish it on /tf_static; the parameter base_frame is {self._base_frame}" if is_pose else ""
         return f"{first}{more}{remedy}"
 
     def _hint(self) -> str:
@@ -96,7 +97,7 @@ class LiveRigDiscovery:
         own = f"{self._node.get_fully_qualified_name()}/"
         types = {topic: names[0] for topic, names in topic_types(self._node).items() if not topic.startswith(own)}
         entries = tuple(discover_cameras(types))
-        images = {topic for topic, name in types.items() if name in (IMAGE_TYPE, COMPRESSED_IMAGE_TYPE)}
+        images = {topic for topic, name in types.items() if name in RECORDED_IMAGE_TYPES}
         self._unpaired = sorted(topic for topic in images if not _has_info(topic, types))
         if entries == self._entries:
             return
@@ -108,7 +109,7 @@ class LiveRigDiscovery:
             self._subscriptions = [self._subscribe(entry, self._assembler) for entry in entries]
 
     def _subscribe(self, entry: CameraEntry, assembler: RigAssembler) -> Subscription:
-        callback = partial(assembler.add_camera_info, entry.name)
+        callback = partial(assembler.add_camera_info_on, entry.camera_info_topic)
         return self._node.create_subscription(
             CameraInfo, entry.camera_info_topic, lambda message: callback(message), qos_profile_sensor_data
         )

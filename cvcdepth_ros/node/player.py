@@ -24,7 +24,7 @@ from rosgraph_msgs.msg import Clock
 from cvcdepth_core.errors import RecordingError
 from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_ros.bags import RecordedMessage, Recording, Topic
-from cvcdepth_ros.messages.camera_discovery import COMPRESSED_IMAGE_TYPE, IMAGE_TYPE
+from cvcdepth_ros.messages.camera_discovery import RECORDED_IMAGE_TYPES
 from cvcdepth_ros.messages.conversion import ros_message_class
 
 CLOCK_TOPIC = "/clock"
@@ -79,8 +79,8 @@ class RecordingPlayer:
 
     def wait_for_subscribers(self, seconds: float) -> list[str]:
         """Wait until every image topic (without any: every topic) has a subscriber; return those that have none."""
-        images = (IMAGE_TYPE, COMPRESSED_IMAGE_TYPE)
-        awaited = [name for name in self._publishers if self._recording.topics[name].type in images]
+        types = {name: self._recording.topics[name].type for name in self._publishers}
+        awaited = [name for name, type_ in types.items() if type_ in RECORDED_IMAGE_TYPES]
         deadline = time.monotonic() + seconds
         while missing := [t for t in awaited or self._publishers if not self._publishers[t].get_subscription_count()]:
             if time.monotonic() > deadline:

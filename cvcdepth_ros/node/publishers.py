@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node's publishers; outputs without subscribers are not computed."""
 
+import time
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,22 +14,26 @@ from cvcdepth_core.errors import ConfigError
 from cvcdepth_core.pointcloud import CloudLimits
 from cvcdepth_ros.messages.conversion import ros_message_class, ros_message_factory
 from cvcdepth_ros.node.qos import refusing_impossible_qos
+from cvcdepth_ros.settings import NodeParameters
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
-from cvcdepth_ros.surround_sets.output_messages import SurroundMessages, camera_topics, output_types
+from cvcdepth_ros.surround_sets.output_messages import CONFIDENCE, SurroundMessages, camera_topics, output_types
 from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet
 
 
 class SurroundOutputs:
     """Publishes one set's depth, pictures and clouds under the node's private names."""
 
-    def __init__(self, node: Node, cameras: list[str], depth_encoding: str, latencies: StageLatencies) -> None:
+    def __init__(self, node: Node, cameras: list[str], parameters: NodeParameters, latencies: StageLatencies) -> None:
         """Advertise; ConfigError names a topic that cannot be."""
+        self._cameras = cameras
         self._node = node
         self._latencies = latencies
-        self._messages = SurroundMessages(ros_message_factory(), depth_encoding)
+        self._messages = SurroundMessages(
+            ros_message_factory(), parameters.depth_encoding, parameters.depth_min_confidence
+        )
         self._publishers: dict[str, Publisher] = {}
         try:
-            for topic, type_name in output_types(cameras).items():
+            for topic, type_name in output_types(cameras, parameters.publish_odometry).items():
                 self._publishers[topic] = self._publisher(topic, type_name)
         except ConfigError:
             self.close()
@@ -38,13 +43,26 @@ class SurroundOutputs:
         """Return whether a topic is subscribed for which this camera's depth is needed."""
         return any(map(self._has_subscribers, camera_topics(camera)))
 
+    def wants_confidence(self) -> bool:
+        """Return whether any camera's confidence is subscribed."""
+        return any(self._has_subscribers(f"{camera}/{CONFIDENCE}") for camera in self._cameras)
+
     def publish(self, estimated: EstimatedSet[Any], frame_ids: Mapping[str, str], limits: CloudLimits) -> None:
-        """Publish one set; see `SurroundMessages.of_set` for stamps and frames."""
-        with self._latencies.measure("postprocess"):
-            outputs = list(self._messages.of_set(estimated, frame_ids, limits, self._has_subscribers))
-        with self._latencies.measure("publish"):
-            for output in outputs:
-                self._publishers[output.topic].publish(output.message)
+        """Publish one set; see `SurroundMessages.of_set` for stamps and frames.
+
+        Each message leaves as soon as it is built: depth does not wait for the clouds.
+        """
+        building = publishing = 0.0
+        began = time.monotonic()
+        for output in self._messages.of_set(estimated, frame_ids, limits, self._has_subscribers):
+            built = time.monotonic()
+            self._publishers[output.topic].publish(output.message)
+            published = time.monotonic()
+            self._latencies.trace("postprocess", began, built)
+            self._latencies.trace("publish", built, published)
+            building, publishing, began = building + built - began, publishing + published - built, published
+        self._latencies.record("postprocess", building)
+        self._latencies.record("publish", publishing)
 
     def close(self) -> None:
         """Drop all publishers."""
@@ -52,7 +70,8 @@ class SurroundOutputs:
             self._node.destroy_publisher(publisher)
 
     def _has_subscribers(self, topic: str) -> bool:
-        return bool(self._publishers[topic].get_subscription_count())
+        publisher = self._publishers.get(topic)  # not all are advertised
+        return publisher is not None and bool(publisher.get_subscription_count())
 
     def _publisher(self, topic: str, type_name: str) -> Publisher:
         with refusing_impossible_qos(topic):

@@ -13,14 +13,15 @@ except ImportError:  # ROS 2 Humble calls the module so, and has no event for ma
 
 from cvcdepth_core.errors import ConfigError
 
-_INPUT_DEPTH = 10
+INPUT_DEPTH = 10
+"""Messages: one second of a 10 Hz camera."""
 
 
-def input_qos(reliable: bool) -> QoSProfile:
-    """Return sensor-data QoS with room for one second of a 10 Hz camera, reliable where asked for."""
+def input_qos(reliable: bool, depth: int = INPUT_DEPTH) -> QoSProfile:
+    """Return sensor-data QoS with room for so many messages, reliable where asked for."""
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
-        depth=_INPUT_DEPTH,
+        depth=depth,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.VOLATILE,
     )

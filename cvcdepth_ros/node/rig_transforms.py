@@ -66,7 +66,8 @@ class RigTransforms:
         self._node.destroy_publisher(self._publisher)
 
     def _given(self) -> Iterator[tuple[str, Pose]]:
-        """Give the frames and poses of the cameras that the rig file places."""
+        """Give the frames and poses of the cameras that the rig file places, and of its turned views."""
+        yield from self._assembler.view_poses().items()
         for camera in self._assembler.layout.cameras:
             frame = self._assembler.frame_id(camera.name)
             if camera.base_T_camera is not None and frame:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """One active period of the node: its topics connected to the pipeline, and the state of each camera."""
 
+from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict
 from pathlib import Path
@@ -28,14 +29,17 @@ from cvcdepth_ros.node.diagnostics import (
     inference_status,
     model_status,
     overlap_status,
+    refinement_status,
     synchronisation_status,
 )
+from cvcdepth_ros.node.motion_input import MotionInput
 from cvcdepth_ros.node.parameters import read_parameters, unknown_qos_overrides
 from cvcdepth_ros.node.publishers import SurroundOutputs
 from cvcdepth_ros.node.rig_transforms import RigTransforms
 from cvcdepth_ros.node.subscriptions import CameraInputs, StaticTransformInput
 from cvcdepth_ros.settings import NodeParameters
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
+from cvcdepth_ros.surround_sets.refinement import RefinementStage
 from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet
 from cvcdepth_ros.surround_sets.synchronizer import SurroundSynchronizer
 from cvcdepth_ros.surround_sets.trace_file import TraceFile
@@ -72,6 +76,7 @@ class SurroundSession:
         """Why images do not arrive that were sent; empty while they do."""
         self._progress = SetProgress(self._synchroniser.required, parameters.tolerance, parameters.max_age)
         self._is_finished = False
+        self._needs_confidence = parameters.needs_confidence
         with ExitStack() as opened:
             trace = None
             if parameters.trace:
@@ -82,8 +87,13 @@ class SurroundSession:
                 transforms = StaticTransformInput(node, assembler.transforms, self._on_transforms)
                 opened.enter_context(closing(transforms))
             self._transforms = self._rig_transforms(opened) if parameters.publish_tf else None
-            outputs = SurroundOutputs(node, layout.names, parameters.depth_encoding, self.latencies)
+            outputs = SurroundOutputs(node, layout.names, parameters, self.latencies)
             self._outputs = opened.enter_context(closing(outputs))
+            motion = MotionInput(node, layout.base_frame, parameters.odometry_topic)
+            self._motion = opened.enter_context(closing(motion))
+            self._refinement = RefinementStage(
+                parameters, motion.poses.poses_at, self._wants_confidence, self.latencies, parameters.publish_odometry
+            )
             self._pipeline = SurroundPipeline(
                 estimator,
                 self._synchroniser,
@@ -93,6 +103,7 @@ class SurroundSession:
                 self._publish,
                 self._watch_overlaps if parameters.overlap_monitor else lambda _: None,
                 self.latencies,
+                self._refinement,
             )
             opened.callback(self._close_pipeline)
             inputs = CameraInputs(node, layout, parameters.reliable, self._on_image, self._on_camera_info)
@@ -103,8 +114,8 @@ class SurroundSession:
             node.get_logger().warning(line)
 
     def _rig_transforms(self, opened: ExitStack) -> RigTransforms | None:
-        """Return what publishes the rig file's poses; None where it has none, or tf2_msgs is not installed."""
-        if all(camera.base_T_camera is None for camera in self._assembler.layout.cameras):
+        """Return what publishes poses that only the rig has; None where there are none, or without tf2_msgs."""
+        if all(camera.base_T_camera is None and not camera.is_turned for camera in self._assembler.layout.cameras):
             return None
         try:
             return opened.enter_context(closing(RigTransforms(self._node, self._assembler)))
@@ -112,9 +123,14 @@ class SurroundSession:
             self._node.get_logger().info("the rig file's poses are not on /tf_static: tf2_msgs is not installed")
             return None
 
+    def _wants_confidence(self) -> bool:
+        return self._needs_confidence or self._outputs.wants_confidence()
+
     def poll(self) -> None:
         """Subscribe image topics that have appeared, and follow how far the sets come. To be called regularly."""
         self._inputs.connect()
+        if self._refinement.is_active:
+            self._motion.connect()
         if self._transforms is not None:
             self._transforms.poll()
         counts = {**asdict(self._mailbox.statistics()), **self._pipeline.counters}
@@ -200,6 +216,7 @@ class SurroundSession:
             ),
             model_status(self._estimator),
             *([overlap_status(self._overlaps)] if self._overlaps else []),
+            *([refinement_status(self._refinement, self._motion.poses)] if self._refinement.is_active else []),
         ]
 
     def _setup_troubles(self, camera: str) -> list[Trouble]:
@@ -216,16 +233,19 @@ class SurroundSession:
     def _close_pipeline(self) -> None:
         self._is_finished = self._pipeline.close()
 
-    def _on_image(self, camera: str, message: Any) -> None:
-        self._ages.record("receive (ROS time)", camera, exposure_times(stamp_ns(message), self._offsets_ns[camera]))
+    def _on_image(self, cameras: Sequence[str], message: Any) -> None:
+        taken = exposure_times(stamp_ns(message), self._offsets_ns[cameras[0]])
+        self._ages.record("receive (ROS time)", cameras[0], taken)
         megabytes = len(message.data) / 1e6
         if megabytes > self._max_image_mb:
-            self._watches[camera].used(f"image of {megabytes:.1f} MB, more than max_image_mb ({self._max_image_mb:g})")
+            too_large = f"image of {megabytes:.1f} MB, more than max_image_mb ({self._max_image_mb:g})"
+            for camera in cameras:
+                self._watches[camera].used(too_large)
             return
-        self._pipeline.add(camera, message)
+        self._pipeline.add(cameras, message)
 
-    def _on_camera_info(self, camera: str, message: Any) -> None:
-        if self._assembler.add_camera_info(camera, message):
+    def _on_camera_info(self, cameras: Sequence[str], message: Any) -> None:
+        if True in [self._assembler.add_camera_info(camera, message) for camera in cameras]:
             self._rebuild()
 
     def _on_transforms(self) -> None:
@@ -248,9 +268,10 @@ class SurroundSession:
             self._node.get_logger().error(str(error))
 
     def _publish(self, published: EstimatedSet[CameraImage]) -> None:
-        frame_ids = {name: self._assembler.frame_id(name) or "" for name in published.rig.names}
-        limits = read_parameters(self._node).cloud_limits
-        self._outputs.publish(published, frame_ids, limits)
+        frame_ids = {name: self._assembler.view_frame_id(name) or "" for name in published.rig.names}
+        parameters = read_parameters(self._node)
+        self._needs_confidence = parameters.needs_confidence
+        self._outputs.publish(published, frame_ids, parameters.cloud_limits)
         newest = max(published.surround_set.times_ns.values())
         self._ages.record("age of newest image at publish (ROS time)", "", newest)
 

@@ -16,16 +16,18 @@ from rclpy.qos import (
 )
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from sensor_msgs.msg import CameraInfo
 
 from cvcdepth_core.errors import ConfigError, TransformError
 from cvcdepth_core.rig.rig_file import CameraEntry, RigLayout
 from cvcdepth_ros.live.camera_states import CameraState, Trouble
-from cvcdepth_ros.messages.camera_discovery import COMPRESSED_IMAGE_TYPE, IMAGE_TYPE
+from cvcdepth_ros.live.video_streams import video_problem
+from cvcdepth_ros.messages.camera_discovery import RECORDED_IMAGE_TYPES, VIDEO_TYPES
+from cvcdepth_ros.messages.conversion import ros_message_class
 from cvcdepth_ros.messages.transforms import TransformTree
-from cvcdepth_ros.node.qos import SubscriptionEventCallbacks, input_qos, refusing_impossible_qos
+from cvcdepth_ros.node.qos import INPUT_DEPTH, SubscriptionEventCallbacks, input_qos, refusing_impossible_qos
 
-_IMAGE_CLASSES = {IMAGE_TYPE: Image, COMPRESSED_IMAGE_TYPE: CompressedImage}
+_VIDEO_DEPTH = 100  # messages: a lost packet costs all until the next key frame
 
 
 def topic_types(node: Node) -> dict[str, list[str]]:
@@ -34,17 +36,19 @@ def topic_types(node: Node) -> dict[str, list[str]]:
 
 
 class CameraInputs:
-    """Subscribes each camera's topics, images as soon as the graph tells whether they are raw or compressed."""
+    """Subscribes each camera's topics, images as soon as the graph tells whether they are raw, compressed or video."""
 
     def __init__(
         self,
         node: Node,
         layout: RigLayout,
         reliable: bool,
-        on_image: Callable[[str, Any], None],
-        on_camera_info: Callable[[str, Any], None],
+        on_image: Callable[[list[str], Any], None],
+        on_camera_info: Callable[[list[str], Any], None],
     ) -> None:
-        """Both callbacks get the camera's name first; they run on the executor's thread and must be short.
+        """Both callbacks get the camera's name first, or the names of all that are views of one lens.
+
+        They run on the executor's thread and must be short.
 
         ConfigError names a camera_info topic that cannot be subscribed.
         """
@@ -52,8 +56,10 @@ class CameraInputs:
         self._cameras: dict[str, _CameraInput] = {}
         try:
             for camera in layout.cameras:
-                callbacks = partial(on_image, camera.name), partial(on_camera_info, camera.name)
-                self._cameras[camera.name] = _CameraInput(node, camera, reliable, *callbacks)
+                names = layout.views_by_image[camera.image_topic]
+                if camera.name == names[0]:
+                    callbacks = partial(on_image, names), partial(on_camera_info, names)
+                    self._cameras |= dict.fromkeys(names, _CameraInput(node, camera, reliable, *callbacks))
         except ConfigError:
             self.close()
             raise
@@ -61,7 +67,7 @@ class CameraInputs:
     @property
     def image_topics(self) -> list[str]:
         """The graph's names of the cameras' image topics, whether they are there or not."""
-        return [camera.image_topic for camera in self._cameras.values()]
+        return [camera.image_topic for camera in self._inputs]
 
     @property
     def lost(self) -> dict[str, int]:
@@ -71,7 +77,7 @@ class CameraInputs:
     def connect(self) -> None:
         """Subscribe the image topics that have appeared since the last call."""
         types = topic_types(self._node)
-        for camera in self._cameras.values():
+        for camera in self._inputs:
             camera.connect(types)
 
     def troubles(self) -> dict[str, list[Trouble]]:
@@ -81,12 +87,17 @@ class CameraInputs:
 
     def close(self) -> None:
         """Drop all subscriptions."""
-        for camera in self._cameras.values():
+        for camera in self._inputs:
             camera.close()
+
+    @property
+    def _inputs(self) -> list["_CameraInput"]:
+        """Each once, whether one camera's or that of all views of a lens."""
+        return list(dict.fromkeys(self._cameras.values()))
 
 
 class _CameraInput:
-    """One camera's subscriptions."""
+    """The subscriptions of one camera, or of all that are views of one lens."""
 
     def __init__(
         self,
@@ -109,10 +120,12 @@ class _CameraInput:
 
     def connect(self, types: Mapping[str, Sequence[str]]) -> None:
         """Subscribe the images if their topic is there and has been tried neither with success nor without."""
-        known = [_IMAGE_CLASSES[name] for name in types.get(self.image_topic, ()) if name in _IMAGE_CLASSES]
+        known = [name for name in types.get(self.image_topic, ()) if name in RECORDED_IMAGE_TYPES]
         if known and self._images is None and not self._refusal:
+            depth = _VIDEO_DEPTH if known[0] in VIDEO_TYPES else INPUT_DEPTH
             try:
-                self._images = self._subscribe(known[0], self._camera.image_topic, self._on_image)
+                message_class = _image_class(known[0], self.image_topic)
+                self._images = self._subscribe(message_class, self._camera.image_topic, self._on_image, depth)
             except ConfigError as error:
                 self._refusal = str(error)
 
@@ -133,7 +146,7 @@ class _CameraInput:
         if self._refusal:
             return [(CameraState.REJECTED, self._refusal)]
         if self._images is None:
-            unusable = f"{topic} carries {', '.join(types.get(topic, ()))}, want {' or '.join(_IMAGE_CLASSES)}"
+            unusable = f"{topic} carries {', '.join(types.get(topic, ()))}, want {' or '.join(RECORDED_IMAGE_TYPES)}"
             return [(CameraState.REJECTED, unusable)]
         return []
 
@@ -146,7 +159,9 @@ class _CameraInput:
                 return f"{topic}: QoS does not match: {reason} See the parameters reliable and qos_overrides."
         return ""
 
-    def _subscribe(self, message_class: type, topic: str, callback: Callable[[Any], None]) -> Subscription:
+    def _subscribe(
+        self, message_class: type, topic: str, callback: Callable[[Any], None], depth: int = INPUT_DEPTH
+    ) -> Subscription:
         def message_lost(event: Any) -> None:
             self.lost += event.total_count_change
 
@@ -156,10 +171,25 @@ class _CameraInput:
                 topic,
                 callback,
                 # Overrides are written into the profile that is handed over: each subscription needs its own.
-                input_qos(self._reliable),
+                input_qos(self._reliable, depth),
                 event_callbacks=SubscriptionEventCallbacks(message_lost=message_lost),
                 qos_overriding_options=QoSOverridingOptions.with_default_policies(),
             )
+
+
+def _image_class(type_name: str, topic: str) -> Any:
+    """Return the class of a type of images; ConfigError names what is to be installed for it."""
+    if type_name in VIDEO_TYPES and (problem := video_problem()):
+        raise ConfigError(f"{topic}: {problem}")
+    try:
+        return ros_message_class(type_name)
+    except (ImportError, AttributeError) as error:
+        package = type_name.partition("/")[0]
+        debian = f"ros-$ROS_DISTRO-{package.replace('_', '-')}"
+        raise ConfigError(
+            f"{topic} carries {type_name}, whose package is not installed: apt install {debian}, or source a workspace "
+            f"with {package}"
+        ) from error
 
 
 def _resolved(node: Node, topic: str) -> str:

@@ -18,6 +18,7 @@ from cvcdepth_ros.recordings.replay import Handlers, RecordedImage, SurroundRepl
 from cvcdepth_ros.recordings.rig_messages import STATIC_TRANSFORMS
 from cvcdepth_ros.settings import OutputSettings
 from cvcdepth_ros.surround_sets.output_messages import (
+    CONFIDENCE,
     MERGED_CAMERAS,
     MERGED_CLOUD,
     SurroundMessages,
@@ -39,7 +40,13 @@ class DepthRecorder:
     """
 
     def __init__(
-        self, path: Path, replay: SurroundReplay, settings: OutputSettings, clouds: CloudChoice, start: int
+        self,
+        path: Path,
+        replay: SurroundReplay,
+        settings: OutputSettings,
+        clouds: CloudChoice,
+        start: int,
+        has_confidence: bool = False,
     ) -> None:
         """Create the folder, announce the topics and write the fixed transforms at the log time `start` (ns).
 
@@ -48,9 +55,13 @@ class DepthRecorder:
         """
         self._replay = replay
         self._settings = settings
-        self._messages = SurroundMessages(bag_message_factory(), settings.depth_encoding)
+        self._messages = SurroundMessages(bag_message_factory(), settings.depth_encoding, settings.depth_min_confidence)
         types = output_types(replay.layout.names)
-        self._topics = {topic: type_ for topic, type_ in types.items() if _is_wanted(topic, type_, clouds)}
+        self._topics = {
+            topic: type_
+            for topic, type_ in types.items()
+            if _is_wanted(topic, type_, clouds) and (has_confidence or not topic.endswith(CONFIDENCE))
+        }
         static_transforms = self._static_transforms(start)
         self._writer = RecordingWriter(path)
         for topic, type_ in self._topics.items():

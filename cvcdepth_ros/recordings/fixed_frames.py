@@ -13,13 +13,14 @@ from cvcdepth_core.errors import TransformError
 from cvcdepth_core.rig.poses import Pose, inverse, quaternion_from_rotation
 from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_ros.bags import RecordedMessage, Recording
+from cvcdepth_ros.messages.recorded_changes import is_quickly_read
 from cvcdepth_ros.messages.transform_topics import moving_transform_topics
 from cvcdepth_ros.messages.transforms import TransformTree, frame_name, links_of
 
 MOVING_TRANSFORMS = "/tf"
 TRANSFORM_TYPE = "tf2_msgs/msg/TFMessage"
 
-# A recording may be hours long, on another machine's disk: so many single seconds, spread over it, are examined.
+# Of a recording that is hours long, or on another machine's disk, so many single seconds, spread over it, are examined.
 _SECONDS_EXAMINED = 20
 # Noise of rounding, and no more: a camera on a sprung cab or a turning head moves by centimetres or degrees.
 _FIXED_METRES, _FIXED_RADIANS = 1e-3, 1e-3
@@ -118,7 +119,7 @@ def _chain(tree: TransformTree, links: Mapping[str, ObservedLink], frame: str, f
 def _spread_messages(recording: Recording) -> Iterator[RecordedMessage]:
     topics = moving_transform_topics(recording)
     duration = recording.end + 1 - recording.start
-    if duration <= _SECONDS_EXAMINED * NANOSECONDS:
+    if duration <= _SECONDS_EXAMINED * NANOSECONDS or is_quickly_read(recording):
         yield from recording.messages(topics)
         return
     for number in range(_SECONDS_EXAMINED):

@@ -6,7 +6,7 @@ skipped: there is no clock to keep up with, hence no mailbox.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import islice
 from typing import Any, NamedTuple
@@ -18,15 +18,17 @@ from cvcdepth_core.errors import CvcDepthError, RecordingError, RigError
 from cvcdepth_core.estimator import DepthPredictor, SurroundDepthEstimator
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.stamps import NANOSECONDS, exposure_times
+from cvcdepth_core.surround_depth import SurroundDepth
 from cvcdepth_ros.bags import RecordedMessage
 from cvcdepth_ros.messages.camera_info import content_of, is_usable
 from cvcdepth_ros.messages.conversion import stamp_ns
 from cvcdepth_ros.messages.recorded_changes import moment_of
 from cvcdepth_ros.recordings.refusals import Refusals
 from cvcdepth_ros.recordings.rig import RecordedRig
-from cvcdepth_ros.recordings.rig_messages import add_camera_info
-from cvcdepth_ros.settings import MatchingSettings
+from cvcdepth_ros.recordings.set_motion import RecordedSetMotion
+from cvcdepth_ros.settings import MatchingSettings, ModelSettings
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
+from cvcdepth_ros.surround_sets.refinement import RefinementStage
 from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet, estimate_set
 from cvcdepth_ros.surround_sets.synchronizer import (
     SurroundSet,
@@ -81,8 +83,8 @@ class SurroundReplay:
 
     @property
     def frame_ids(self) -> dict[str, str]:
-        """Each camera's optical frame."""
-        return {name: self._assembler.frame_id(name) or "" for name in self.layout.names}
+        """The optical frame of each camera's picture."""
+        return {name: self._assembler.view_frame_id(name) or "" for name in self.layout.names}
 
     @property
     def calibration_changes(self) -> list[str]:
@@ -107,7 +109,7 @@ class SurroundReplay:
         `handlers` are given the messages of further topics in between, at their time; topics that are not in the
         recording are passed over.
         """
-        cameras = {camera.image_topic: camera.name for camera in self.layout.cameras}
+        cameras = self.layout.views_by_image
         infos = {camera.camera_info_topic for camera in self.layout.cameras}
         handlers = handlers or {}
         topics = {*cameras, *infos, *handlers} & self.recording.topics.keys()
@@ -132,23 +134,26 @@ class SurroundReplay:
 
     def _firing_offsets(self, start: int | None, stop: int | None) -> dict[str, float]:
         """Median seconds by which each camera's nearest image is later than the anchor's, stamp offsets subtracted."""
-        cameras = {camera.image_topic: camera for camera in self.layout.cameras}
+        cameras = self.layout.views_by_image
+        offsets_ns = {camera.name: camera.stamp_offset_ns for camera in self.layout.cameras}
         stamps: dict[str, list[float]] = {name: [] for name in self.layout.names}
         for message in islice(self.recording.messages(cameras, start, stop), _IMAGES_TO_EXPLAIN):
-            camera = cameras[message.topic]
             with suppress(RecordingError):
                 stamp = stamp_ns(self.recording.deserialize(message))
-                stamps[camera.name].append(exposure_times(stamp, camera.stamp_offset_ns) / NANOSECONDS)
+                for camera in cameras[message.topic]:
+                    stamps[camera].append(exposure_times(stamp, offsets_ns[camera]) / NANOSECONDS)
         anchor = np.array(stamps[self.layout.anchor_camera])
         return {name: _median_distance(anchor, np.array(found)) for name, found in stamps.items()}
 
-    def _add_image(self, camera: str, message: RecordedMessage) -> list[SurroundSet[RecordedImage]]:
+    def _add_image(self, cameras: Sequence[str], message: RecordedMessage) -> Iterator[SurroundSet[RecordedImage]]:
+        """Add an image for each of the cameras that are views of its lens."""
         try:
             image = self.recording.deserialize(message)
         except RecordingError as error:
-            self.unreadable.add(f"camera {camera}: {error}")
-            return []
-        return self._synchroniser.add(camera, stamp_ns(image), RecordedImage(image, message.log_time))
+            self.unreadable.add(f"camera {', '.join(cameras)}: {error}")
+            return
+        for camera in cameras:
+            yield from self._synchroniser.add(camera, stamp_ns(image), RecordedImage(image, message.log_time))
 
     def _add_camera_info(self, message: RecordedMessage) -> None:
         try:
@@ -158,7 +163,7 @@ class SurroundReplay:
             return
         if self._says_nothing_new(message.topic, info):
             return
-        if add_camera_info(self._assembler, message.topic, info):
+        if self._assembler.add_camera_info_on(message.topic, info):
             try:
                 self._rig = self._assembler.rig()
             except RigError as error:
@@ -178,14 +183,30 @@ class DepthReplay:
     """Estimates every set of a replay. A set that cannot be estimated is left out and counted in `refused`."""
 
     def __init__(
-        self, replay: SurroundReplay, estimator: DepthPredictor, latencies: StageLatencies | None = None
+        self,
+        replay: SurroundReplay,
+        estimator: DepthPredictor,
+        latencies: StageLatencies | None = None,
+        settings: ModelSettings | None = None,
+        wants_confidence: bool = False,
     ) -> None:
-        """Prepare for the replay's rig; RigError names a mask that does not fit."""
+        """Prepare for the replay's rig; RigError names a mask that does not fit.
+
+        `settings` say whether depth is refined (None: it is not); without, confidence may be wanted all the same.
+        """
         self.refused = Refusals()
         self.latencies = latencies or StageLatencies()
         self.estimator = estimator
         self._replay = replay
         self._surround = SurroundDepthEstimator(replay.rig, estimator)
+        is_compared = wants_confidence or (settings is not None and settings.refine != "off")
+        self._motion = RecordedSetMotion.of(replay.recorded) if is_compared else None
+        self.refinement = RefinementStage(
+            settings or ModelSettings.model_validate({"refine": "off"}),
+            self._motion.poses_at if self._motion else lambda _: None,
+            lambda: wants_confidence,
+            self.latencies,
+        )
 
     def sets(
         self,
@@ -194,18 +215,24 @@ class DepthReplay:
         handlers: Handlers | None = None,
         stamp_ns: int | None = None,
     ) -> Iterator[EstimatedSet[RecordedImage]]:
-        """Yield the sets of `SurroundReplay.sets` with their depth; with a stamp, the set of that stamp only."""
+        """Yield the sets of `SurroundReplay.sets` with their depth; with a stamp, the set of that stamp only.
+
+        Those before it are estimated all the same where its depth is refined with them.
+        """
         for surround_set in self._replay.sets(start, stop, handlers):
-            if stamp_ns not in (None, surround_set.stamp_ns):
+            is_wanted = stamp_ns in (None, surround_set.stamp_ns)
+            if not is_wanted and not self.refinement.is_active:
                 continue
             try:
                 surround = self._current_surround()
                 messages = {name: image.message for name, image in surround_set.images.items()}
                 result = estimate_set(messages, surround, self.latencies, self._replay.required)
+                estimated = self._finished(surround, surround_set, result)
             except CvcDepthError as error:
                 self.refused.add(f"set at {surround_set.stamp_ns} ns: {error}")
             else:
-                yield EstimatedSet(surround_set, surround.rig, result)
+                if is_wanted:
+                    yield estimated
 
     def why_no_set(self, start: int | None = None, stop: int | None = None) -> str:
         """Return why `sets` yielded none: what was refused, else `SurroundReplay.why_no_set`."""
@@ -213,6 +240,19 @@ class DepthReplay:
             if refusals.count:
                 return str(refusals)
         return self._replay.why_no_set(start, stop)
+
+    @property
+    def surround(self) -> SurroundDepthEstimator:
+        """What estimated the last set."""
+        return self._surround
+
+    def _finished(
+        self, surround: SurroundDepthEstimator, surround_set: SurroundSet[RecordedImage], result: SurroundDepth
+    ) -> EstimatedSet[RecordedImage]:
+        if self._motion is not None and self.refinement.is_active:
+            with self.latencies.measure("motion"):
+                self._motion.read_to(max(image.log_time for image in surround_set.images.values()))
+        return self.refinement.finished(surround, surround_set, result)
 
     def _current_surround(self) -> SurroundDepthEstimator:
         if self._surround.rig is not self._replay.rig:

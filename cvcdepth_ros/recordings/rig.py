@@ -11,6 +11,7 @@ from pydantic import ValidationError
 
 from cvcdepth_core.errors import RecordingError, RigError, first_validation_message
 from cvcdepth_core.rig.rig_file import CameraEntry, RigLayout
+from cvcdepth_core.rig.wide_lenses import from_left_to_right, lens_name
 from cvcdepth_ros.bags import Recording
 from cvcdepth_ros.messages.camera_discovery import (
     CAMERA_INFO_TYPE,
@@ -19,7 +20,7 @@ from cvcdepth_ros.messages.camera_discovery import (
 from cvcdepth_ros.messages.recorded_cameras import find_recorded_cameras
 from cvcdepth_ros.messages.recorded_changes import find_calibration_changes
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
-from cvcdepth_ros.messages.transforms import TransformTree
+from cvcdepth_ros.messages.transforms import TransformTree, frame_name
 from cvcdepth_ros.recordings.motion import MotionLink, VehicleMotion, find_motion_link
 from cvcdepth_ros.recordings.rig_messages import RigMessages
 
@@ -38,7 +39,7 @@ class RecordedRig:
         self._messages = messages
         assembler = messages.assembler(layout)
         for problem in assembler.problems().values():
-            raise RigError(f"{recording.path}: {problem}")
+            raise RigError(f"{recording.path}: {problem}{_remedy(assembler)}")
         self.transforms: TransformTree = assembler.transforms
         """The fixed transforms."""
 
@@ -57,7 +58,13 @@ class RecordedRig:
         for problem in topic_problems(recording, chosen):
             raise RecordingError(f"{recording.path}: {problem}")
         found = cls(recording, chosen, messages)
-        return found.completed() if layout is None else found
+        return found if layout is not None else found.with_split_lenses().completed()
+
+    def with_split_lenses(self) -> RecordedRig:
+        """Return the same with two or three cameras in the place of each wide lens, see `split_wide_lenses`."""
+        assembler = self.assembler()
+        assembler.split_wide_lenses()
+        return self.with_layout(assembler.layout)
 
     def completed(self) -> RecordedRig:
         """Return the same with all that was collected in its layout, the cameras ordered around the vehicle."""
@@ -95,6 +102,7 @@ class RecordedRig:
             *found.choices,
             *found.left_out,
             *self.open_assembler()[0].notes,
+            *_split_lenses(self.layout),
             *(f"{change}; the rig is that of what comes before" for change in changes),
         ]
 
@@ -120,6 +128,21 @@ class RecordedRig:
     @cached_property
     def _motion_link(self) -> MotionLink | None:
         return find_motion_link(self.recording, self.layout.base_frame, self.transforms)
+
+
+def _split_lenses(layout: RigLayout) -> Iterator[str]:
+    for names in layout.views_by_image.values():
+        if len(names) > 1:
+            views = ", ".join(from_left_to_right(layout, names))
+            yield f"camera {lens_name(names)}: shown by {views}, views of its one lens"
+
+
+def _remedy(assembler: RigAssembler) -> str:
+    """Return what helps where none of the transforms knows the base frame."""
+    frames = assembler.transforms.frames
+    if not frames or frame_name(assembler.layout.base_frame) in frames:
+        return ""
+    return "; name the vehicle's frame with --base-frame, or as base_frame in the rig file"
 
 
 def discover_rig(recording: Recording, base_frame: str = "base_link") -> RigLayout:

@@ -108,7 +108,7 @@ class RigMessages:
             if infos and not readable:
                 raise infos[0]
             for info in readable:
-                add_camera_info(assembler, topic, info)
+                assembler.add_camera_info_on(topic, info)
         if self._contradiction is not None:
             raise self._contradiction
         if moving_transform_topics(self._recording):
@@ -194,12 +194,6 @@ class RigMessages:
 def cloud_topics(recording: Recording) -> list[str]:
     """Return the names of all topics with point clouds, sorted."""
     return sorted(topic.name for topic in recording.topics.values() if topic.type == POINT_CLOUD_TYPE and topic.count)
-
-
-def add_camera_info(assembler: RigAssembler, topic: str, message: Any) -> bool:
-    """Add a CameraInfo to every camera of that topic; return whether it changes anything."""
-    cameras = [camera.name for camera in assembler.layout.cameras if camera.camera_info_topic == topic]
-    return True in [assembler.add_camera_info(camera, message) for camera in cameras]
 
 
 def _camera_topics(recording: Recording, layout: RigLayout | None) -> set[str]:

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
+from cvcdepth_core.scoring.confidence import CalibrationTable
 from cvcdepth_core.scoring.scores import ALL, OVERLAP, Score
 from cvcdepth_ros.evaluation.image_scores import SetScore
 from cvcdepth_ros.evaluation.result import EvaluationResult
@@ -64,6 +65,22 @@ def label_free_against_error(sets: Sequence[SetScore]) -> bytes:
     axes.set_xlabel("median relative disagreement", color=TEXT)
     axes.set_ylabel("Abs Rel", color=TEXT)
     axes.margins(0.1)
+    add_legend(axes)
+    return to_png(figure)
+
+
+def calibration_curve(table: CalibrationTable) -> bytes:
+    """Draw how often depth is right over how sure it is said to be, and how many pixels that are."""
+    figure, (axes,) = dark_figure(6.4, 3.4)
+    edges = np.arange(len(table.pixels)) / len(table.pixels)
+    shares = table.pixels / max(int(table.pixels.sum()), 1)
+    axes.bar(edges + 0.05, shares, 0.09, color=LINES, label="share of the pixels")
+    axes.plot([0, 1], [0, 1], color=TEXT, linewidth=0.8, linestyle="--", label="perfect")
+    known = table.pixels > 0
+    axes.plot(table.predicted[known], table.actual[known], color=BLUE, marker="o", label="right within 1.25")
+    add_title(axes, "how often depth is right, by its confidence")
+    axes.set_xlabel("confidence", color=TEXT)
+    axes.set_ylim(0, 1.05)
     add_legend(axes)
     return to_png(figure)
 

@@ -98,6 +98,8 @@ def _figures(result: EvaluationResult) -> dict[str, bytes]:
     series = {"series": figures.time_series(result.sets)}
     if not result.truth_points:
         return series
+    if result.confidence is not None:
+        series["calibration"] = figures.calibration_curve(result.confidence.calibration)
     return series | {
         "ranges": figures.error_by_range(result),
         "cameras": figures.error_by_camera(result),

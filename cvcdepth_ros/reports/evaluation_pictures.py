@@ -89,12 +89,12 @@ def error_colours(relative: NDArray[np.float64]) -> Colours:
     return colours
 
 
-def _error_colours(truth: SparseDepth, prediction: NDArray[np.float32]) -> Colours:
-    relative = sample_prediction(prediction, truth) / truth.depth - 1
+def _error_colours(truth: SparseDepth, prediction: NDArray[np.float64]) -> Colours:
+    relative = prediction / truth.depth - 1
     return np.where(np.isnan(relative)[:, None], np.uint8(0), error_colours(np.nan_to_num(relative)))
 
 
-def _tiles(measured: MeasuredSet, colours: Callable[[SparseDepth, NDArray[np.float32]], Colours]) -> list[list[Tile]]:
+def _tiles(measured: MeasuredSet, colours: Callable[[SparseDepth, NDArray[np.float64]], Colours]) -> list[list[Tile]]:
     rig, depth = measured.estimated.rig, measured.estimated.result.depth
     rows = []
     for names in viewing_rows(rig):
@@ -102,7 +102,8 @@ def _tiles(measured: MeasuredSet, colours: Callable[[SparseDepth, NDArray[np.flo
         for index in map(rig.names.index, names):
             picture = _dimmed(_rectified(measured, rig.cameras[index]))
             truth = measured.truth[index]
-            _dot(picture, truth, colours(truth, depth[index]))
+            part = rig.cameras[index].network_part(*depth[index].shape)
+            _dot(picture, truth, colours(truth, sample_prediction(depth[index], truth, part)))
             tiles.append(Tile(rig.names[index], to_jpeg(picture), picture.shape[1], picture.shape[0]))
         rows.append(tiles)
     return rows

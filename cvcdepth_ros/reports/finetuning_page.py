@@ -17,7 +17,7 @@ from cvcdepth_ros.evaluation.image_scores import SetScore
 from cvcdepth_ros.evaluation.job import EvaluationJob
 from cvcdepth_ros.evaluation.measuring import Remeasuring
 from cvcdepth_ros.evaluation.result import EvaluationResult
-from cvcdepth_ros.finetuning.card import SCORE_TITLES
+from cvcdepth_ros.finetuning.card import SCORE_TITLES, pose_lines
 from cvcdepth_ros.finetuning.run import START_FILE, FinetuneResult
 from cvcdepth_ros.reports.evaluation_pictures import SetPictures
 from cvcdepth_ros.reports.learning_curves import RunLog, held_out_curves, loss_curves
@@ -40,6 +40,7 @@ def render(card: Mapping[str, Any], shown: Sequence[ShownSet], log: RunLog, mask
         "shown": shown,
         "masks": masks,
         "score_titles": SCORE_TITLES,
+        "pose_lines": list(filter(None, pose_lines(card["scores"]))),
         "curves": to_png(loss_curves(log)) if log.steps else None,
         "held_out": to_png(held_out_curves(log)) if log.validations else None,
         "configuration": json.dumps(card["configuration"], indent=2),

@@ -6,22 +6,29 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from cvcdepth_core.pointcloud import CloudLimits, merged_cloud, organised_cloud
+from cvcdepth_core.refinement.drive import VisualMotion
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.surround_depth import SurroundDepth
 from cvcdepth_ros.messages.camera_discovery import CAMERA_INFO_TYPE, IMAGE_TYPE
-from cvcdepth_ros.messages.conversion import MessageFactory
+from cvcdepth_ros.messages.conversion import Covariances, MessageFactory
 from cvcdepth_ros.messages.point_clouds import POINT_CLOUD_TYPE
+from cvcdepth_ros.messages.vehicle_motion import ODOMETRY_TYPE
 from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet
+
+_VISUAL_WORLD = "visual_odom"
 
 STRING_TYPE = "std_msgs/msg/String"
 
 MERGED_CLOUD = "points"
 MERGED_CAMERAS = "points/cameras"
 DEPTH, DEPTH_INFO = "depth/image_rect", "depth/camera_info"
+CONFIDENCE = "depth/confidence"
+ODOMETRY = "odometry"
 PICTURE, PICTURE_INFO, CLOUD = "image_rect", "camera_info", "points"
 _CAMERA_TYPES = {
     DEPTH: IMAGE_TYPE,
     DEPTH_INFO: CAMERA_INFO_TYPE,
+    CONFIDENCE: IMAGE_TYPE,
     PICTURE: IMAGE_TYPE,
     PICTURE_INFO: CAMERA_INFO_TYPE,
     CLOUD: POINT_CLOUD_TYPE,
@@ -38,10 +45,11 @@ class OutputMessage(NamedTuple):
     message: Any
 
 
-def output_types(cameras: Sequence[str]) -> dict[str, str]:
+def output_types(cameras: Sequence[str], has_odometry: bool = False) -> dict[str, str]:
     """Return every output topic, below the node's name, with its message type."""
+    odometry = {ODOMETRY: ODOMETRY_TYPE} if has_odometry else {}
     per_camera = {f"{camera}/{part}": type_ for camera in cameras for part, type_ in _CAMERA_TYPES.items()}
-    return {**per_camera, MERGED_CLOUD: POINT_CLOUD_TYPE, MERGED_CAMERAS: STRING_TYPE}
+    return {**per_camera, MERGED_CLOUD: POINT_CLOUD_TYPE, MERGED_CAMERAS: STRING_TYPE, **odometry}
 
 
 def camera_topics(camera: str) -> list[str]:
@@ -49,15 +57,17 @@ def camera_topics(camera: str) -> list[str]:
 
     What a merged cloud contains is known when it could be made.
     """
-    return [*(f"{camera}/{part}" for part in _CAMERA_TYPES), MERGED_CLOUD, MERGED_CAMERAS]
+    return [*(f"{camera}/{part}" for part in _CAMERA_TYPES), MERGED_CLOUD, MERGED_CAMERAS, ODOMETRY]
 
 
 class SurroundMessages:
     """Builds the messages of surround sets, with the message classes of one library."""
 
-    def __init__(self, factory: MessageFactory, depth_encoding: str) -> None:
+    def __init__(self, factory: MessageFactory, depth_encoding: str, depth_min_confidence: float = 0.0) -> None:
+        """Depth images are unknown where confidence is below `depth_min_confidence`."""
         self._factory = factory
         self._encoding = depth_encoding
+        self._least = depth_min_confidence
 
     def of_set(
         self,
@@ -75,12 +85,22 @@ class SurroundMessages:
         for index, camera in enumerate(rig.names):
             if result.present[index]:
                 stamp = surround_set.stamps_ns[camera]
-                for part, build in self._camera_messages(result, index, stamp, frame_ids[camera]).items():
+                builders = self._camera_messages(result, index, stamp, frame_ids[camera], limits.min_confidence)
+                for part, build in builders.items():
                     if wanted(f"{camera}/{part}"):
                         yield OutputMessage(f"{camera}/{part}", camera, build())
         for topic, build in self._merged_messages(surround_set.stamp_ns, result, rig, limits).items():
             if wanted(topic):
                 yield OutputMessage(topic, surround_set.anchor, build())
+        if estimated.visual is not None and wanted(ODOMETRY):
+            yield OutputMessage(ODOMETRY, surround_set.anchor, self._odometry(estimated.visual, rig.base_frame))
+
+    def _odometry(self, visual: VisualMotion, base_frame: str) -> Any:
+        """Return the motion that the pictures tell; its world is another one after every gap."""
+        errors = Covariances(visual.covariance, visual.aligned.covariance)
+        return self._factory.odometry(
+            visual.time_ns, _VISUAL_WORLD, base_frame, visual.world_T_base, visual.aligned.twist, errors
+        )
 
     def _merged_messages(
         self, stamp: int, result: SurroundDepth, rig: Rig, limits: CloudLimits
@@ -94,14 +114,18 @@ class SurroundMessages:
         }
 
     def _camera_messages(
-        self, result: SurroundDepth, index: int, stamp: int, frame_id: str
+        self, result: SurroundDepth, index: int, stamp: int, frame_id: str, least: float
     ) -> dict[str, Callable[[], Any]]:
-        """Return how to build each of one camera's messages."""
-        metres, intrinsics, picture = result.depth[index], result.intrinsics[index], result.pictures[index]
-        return {
-            DEPTH: lambda: self._factory.depth_image(stamp, frame_id, metres, self._encoding),
-            DEPTH_INFO: lambda: self._factory.camera_info(stamp, frame_id, intrinsics, *metres.shape),
-            PICTURE: lambda: self._factory.colour_image(stamp, frame_id, picture),
-            PICTURE_INFO: lambda: self._factory.camera_info(stamp, frame_id, intrinsics, *metres.shape),
-            CLOUD: lambda: self._factory.point_cloud(stamp, frame_id, organised_cloud(result, index)),
+        """Return how to build each of one camera's messages; clouds of pixels with at least that confidence."""
+        make, intrinsics, picture = self._factory, result.intrinsics[index], result.pictures[index]
+        size, confidence = result.depth[index].shape, result.confidence
+        builders: dict[str, Callable[[], Any]] = {
+            DEPTH: lambda: make.depth_image(stamp, frame_id, result.sure_depth(index, self._least), self._encoding),
+            DEPTH_INFO: lambda: make.camera_info(stamp, frame_id, intrinsics, *size),
+            PICTURE: lambda: make.colour_image(stamp, frame_id, picture),
+            PICTURE_INFO: lambda: make.camera_info(stamp, frame_id, intrinsics, *size),
+            CLOUD: lambda: make.point_cloud(stamp, frame_id, organised_cloud(result, index, least)),
         }
+        if confidence is not None:
+            builders[CONFIDENCE] = lambda: make.confidence_image(stamp, frame_id, confidence[index])
+        return builders

@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """From the image messages of one set to depth, for the bag tool and the evaluation, and the live node's part of it."""
 
+import threading
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 from cvcdepth_core.errors import ImageError
 from cvcdepth_core.estimator import SurroundDepthEstimator
-from cvcdepth_core.images.decoding import Picture
+from cvcdepth_core.images.decoding import Picture, Reduction
 from cvcdepth_core.images.rectifier import Rectifier
+from cvcdepth_core.refinement.drive import VisualMotion
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.surround_depth import SurroundDepth
 from cvcdepth_ros.messages.conversion import picture_from_message
@@ -30,6 +33,8 @@ class EstimatedSet(Generic[T]):
     """As it was at this set: calibrations may change meanwhile."""
     result: SurroundDepth
     """Arrays in the order of the rig's cameras."""
+    visual: VisualMotion | None = None
+    """What the pictures tell of the vehicle's motion; None where they were not followed."""
 
 
 def estimate_set(
@@ -40,10 +45,11 @@ def estimate_set(
     Raises ImageError, naming what is wrong with them, when fewer than `required` images are left.
     """
     rectifiers = surround.preprocessor.rectifiers
+    images = images_of(messages)
     outcomes = {
-        name: picture_or_error(messages[name], name, rectifier, latencies)
+        name: picture_or_error(images[name], name, rectifier, latencies)
         for name, rectifier in rectifiers.items()
-        if name in messages
+        if name in images
     }
     pictures = usable_pictures(outcomes, len(messages), required)
     with latencies.measure("inference"):
@@ -58,14 +64,43 @@ def usable_pictures(outcomes: Mapping[str, Outcome], cameras: int, required: int
     return {name: outcome for name, outcome in outcomes.items() if not isinstance(outcome, ImageError)}
 
 
-def picture_or_error(message: Any, camera: str, rectifier: Rectifier, latencies: StageLatencies) -> Outcome:
-    """Take one image message to the network's picture.
+class EncodedImage:
+    """An image message, decoded once for all the cameras that are views of its lens. Thread-safe."""
+
+    def __init__(self, message: Any, is_shared: bool = False) -> None:
+        """Where it is not shared, the picture is not kept."""
+        self._message = message
+        self._is_shared = is_shared
+        self._pictures: dict[Reduction, Picture] = {}
+        self._lock = threading.Lock()
+
+    def decoded(self, camera: str, rectifier: Rectifier) -> Picture:
+        """Return the picture, reduced as the rectifier takes it; ImageError as for `picture_from_message`."""
+        reduction = rectifier.reduction
+        if not self._is_shared:
+            return picture_from_message(self._message, camera, reduction, rectifier.image_size)
+        with self._lock:
+            if reduction not in self._pictures:
+                picture = picture_from_message(self._message, camera, reduction, rectifier.image_size)
+                self._pictures[reduction] = picture
+            return self._pictures[reduction]
+
+
+def images_of(messages: Mapping[str, Any]) -> dict[str, EncodedImage]:
+    """Return each camera's image; cameras that have the very same message share it."""
+    uses = Counter(map(id, messages.values()))
+    images = {id(message): EncodedImage(message, uses[id(message)] > 1) for message in messages.values()}
+    return {name: images[id(message)] for name, message in messages.items()}
+
+
+def picture_or_error(image: EncodedImage, camera: str, rectifier: Rectifier, latencies: StageLatencies) -> Outcome:
+    """Take one image to the network's picture.
 
     The error names the camera whose image is damaged, of an unknown encoding, or not of the calibration's size.
     """
     try:
         with latencies.measure("decode"):
-            picture = picture_from_message(message, camera, rectifier.reduction, rectifier.image_size)
+            picture = image.decoded(camera, rectifier)
         with latencies.measure("preprocess"):
             return rectifier(picture, camera, rectifier.reduction)
     except ImageError as error:

@@ -6,11 +6,11 @@ An index is built in one pass and kept beside the run; it is built anew when a f
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -30,8 +30,11 @@ from cvcdepth_ros.recordings.truth import RecordedTruth
 from cvcdepth_ros.settings import MatchingSettings
 from cvcdepth_ros.surround_sets.synchronizer import SurroundSet
 
-_FORMAT = 3
+_FORMAT = 4
 _THUMBNAIL = (40, 24)
+
+ScaleSource = Literal["overlaps", "overlaps or motion", "nothing"]
+"""What metric scale is to be learnt from: a recording without it is refused."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +54,8 @@ class RecordingIndex:
     """[S, h, w] small grey pictures of the anchor camera, to measure change by where no motion is recorded."""
     without_motion: int = 0
     """Sets left out since they lie outside of the recorded motion."""
+    motion_topic: str | None = None
+    """Where the motion is recorded."""
     unread: tuple[str, ...] = ()
     """Descriptions of messages and sets that could not be read or used."""
 
@@ -81,18 +86,19 @@ def load_index(
     matching: MatchingSettings,
     rig_layout: RigLayout | None = None,
     base_frame: str = "base_link",
+    scale_from: ScaleSource = "overlaps",
 ) -> RecordingIndex:
     """Return the index of the recording at `path`, from `directory` when a current one is there, else built and kept.
 
     `rig_layout` names cameras and what the recording lacks; without it the cameras are found, and `base_frame` is the
-    vehicle's. Raises RecordingError, RigError or TransformError, naming the recording, when it has no sets or no
-    complete rig.
+    vehicle's. Raises RecordingError, RigError or TransformError, naming the recording, when it has no sets, no complete
+    rig, or nothing to learn the scale from.
     """
     kept = KeptResults(directory, _to_arrays, partial(_from_arrays, path))
     return kept.load_or_make(
         str(path),
         _work(path, matching, rig_layout, base_frame),
-        lambda: build_index(path, matching, rig_layout, base_frame),
+        lambda: build_index(path, matching, rig_layout, base_frame, scale_from),
     )
 
 
@@ -101,31 +107,49 @@ def build_index(
     matching: MatchingSettings,
     rig_layout: RigLayout | None = None,
     base_frame: str = "base_link",
+    scale_from: ScaleSource = "overlaps",
 ) -> RecordingIndex:
     """Return the index of the recording at `path`, read anew; see `load_index`."""
     with open_recording(path) as recording:
         if rig_layout is None:
             _refuse_blind_cameras(recording)
-            return index_recording(RecordedRig.from_recording(recording, base_frame=base_frame), matching)
-        return index_recording(RecordedRig.from_recording(recording, rig_layout).completed(), matching)
+            recorded = RecordedRig.from_recording(recording, base_frame=base_frame)
+        else:
+            recorded = RecordedRig.from_recording(recording, rig_layout).completed()
+        return index_recording(recorded, matching, scale_from)
 
 
-def index_recording(recorded: RecordedRig, matching: MatchingSettings, needs_overlaps: bool = True) -> RecordingIndex:
-    """Return the index of a rig's recording, which is read through; see `load_index` for the errors.
-
-    Depth is learnt from overlaps; for what needs none, cameras may be alone.
-    """
+def index_recording(
+    recorded: RecordedRig, matching: MatchingSettings, scale_from: ScaleSource = "overlaps"
+) -> RecordingIndex:
+    """Return the index of a rig's recording, which is read through; see `load_index` for the errors."""
     path, layout = recorded.recording.path, recorded.layout
-    if needs_overlaps:
-        _refuse_lonely_cameras(recorded)
-    replay = SurroundReplay(recorded, matching)
     truth = RecordedTruth(recorded, lidar=())
     motion = truth.motion
+    if scale_from == "overlaps" or (scale_from == "overlaps or motion" and motion is None):
+        _refuse_lonely_cameras(recorded)
+    replay = SurroundReplay(recorded, matching)
     sets, thumbnails = _collect(replay, truth)
     for change in replay.calibration_changes[:1]:
         raise RigError(f"{path}: {change}; take the parts before and after as two recordings")
     if not sets:
         raise RecordingError(f"{path}: no surround set: {replay.why_no_set()}")
+    unread = tuple(_unread(replay, truth.refused, len(sets)))
+    return index_of_sets(path, layout, sets, motion, thumbnails, unread)
+
+
+def index_of_sets(
+    path: Location,
+    layout: RigLayout,
+    sets: Sequence[SurroundSet[int]],
+    motion: VehicleMotion | None,
+    thumbnails: Sequence[NDArray[np.uint8]],
+    unread: tuple[str, ...] = (),
+) -> RecordingIndex:
+    """Return the index of sets that hold their images' log times; thumbnails of each where no motion is recorded.
+
+    Raises RecordingError where the motion reaches none of them.
+    """
     poses = None if motion is None else [_poses(motion, surround_set) for surround_set in sets]
     placed = [i for i in range(len(sets)) if poses is None or poses[i] is not None]
     if not placed:
@@ -138,7 +162,8 @@ def index_recording(recorded: RecordedRig, matching: MatchingSettings, needs_ove
         poses=None if poses is None else np.array([poses[i] for i in placed]).reshape(-1, len(layout.names), 4, 4),
         thumbnails=np.stack(thumbnails) if motion is None else None,
         without_motion=len(sets) - len(placed),
-        unread=tuple(_unread(replay, truth.refused, len(sets))),
+        motion_topic=None if motion is None else motion.topic,
+        unread=unread,
     )
 
 
@@ -153,11 +178,16 @@ def _unread(replay: SurroundReplay, refused: Refusals, sets: int) -> Iterator[st
 
 def _refuse_lonely_cameras(recorded: RecordedRig) -> None:
     neighbours = recorded.layout.complete().neighbours
-    lonely = [name for name, others in neighbours.items() if not others]
+    lonely = [
+        " and ".join(views)
+        for views in recorded.layout.views_by_image.values()
+        if all(other in views for name in views for other in neighbours[name])
+    ]
     if lonely:
         raise RigError(
             f"{recorded.recording.path}: camera {', '.join(lonely)}: shares no view with another camera, so there is "
-            "no overlap to learn metric depth from; `cvcdepth rig` shows the overlaps"
+            "no overlap to learn metric depth from; `cvcdepth rig` shows the overlaps. With recorded motion "
+            "(recordings.motion: auto) the scale comes from the odometry"
         )
 
 
@@ -173,7 +203,8 @@ def _collect(replay: SurroundReplay, truth: RecordedTruth) -> tuple[list[Surroun
     sets, thumbnails = [], []
     for found in replay.sets(handlers=truth.handlers):
         if truth.motion is None:
-            thumbnail = _thumbnail(found, replay.layout.anchor_camera)
+            anchor = replay.layout.anchor_camera
+            thumbnail = thumbnail_of(found.images[anchor].message, anchor)
             if thumbnail is None:
                 continue
             thumbnails.append(thumbnail)
@@ -188,9 +219,10 @@ def _with_log_times(found: SurroundSet[RecordedImage]) -> SurroundSet[int]:
     )
 
 
-def _thumbnail(found: SurroundSet[RecordedImage], camera: str) -> NDArray[np.uint8] | None:
+def thumbnail_of(message: Any, camera: str) -> NDArray[np.uint8] | None:
+    """Return a camera's image as `RecordingIndex.thumbnails` has it; None where it cannot be decoded."""
     try:
-        picture = picture_from_message(found.images[camera].message, camera)
+        picture = picture_from_message(message, camera)
     except ImageError:
         return None
     small: NDArray[np.uint8] = cv2.resize(
@@ -206,7 +238,7 @@ def _poses(motion: VehicleMotion, found: SurroundSet[int]) -> NDArray[np.float64
         return None
 
 
-def _table(sets: list[SurroundSet[int]], kept: list[int], row: Any) -> NDArray[np.int64]:
+def _table(sets: Sequence[SurroundSet[int]], kept: list[int], row: Any) -> NDArray[np.int64]:
     return np.array([row(sets[i]) for i in kept], dtype=np.int64).reshape(len(kept), -1)
 
 
@@ -224,6 +256,7 @@ def _to_arrays(index: RecordingIndex) -> Arrays:
     described = {
         "layout": index.layout.model_dump_json(),
         "without_motion": index.without_motion,
+        "motion_topic": index.motion_topic,
         "unread": index.unread,
     }
     arrays = {name: getattr(index, name) for name in ("stamps", "log_times", "poses", "thumbnails")}
@@ -241,5 +274,6 @@ def _from_arrays(path: Location, arrays: Arrays) -> RecordingIndex:
         arrays.get("poses"),
         arrays.get("thumbnails"),
         described["without_motion"],
+        described["motion_topic"],
         tuple(described["unread"]),
     )

@@ -20,8 +20,17 @@ from cvcdepth_core.training.batch import RigBatch
 from cvcdepth_core.training.config import RecordingsConfig, TrainingConfig
 from cvcdepth_core.training.distributed import SINGLE_PROCESS, Processes
 from cvcdepth_ros.training_data.index import RecordingIndex
-from cvcdepth_ros.training_data.sample_choice import Sample, find_samples, refuse_standstill
+from cvcdepth_ros.training_data.sample_choice import (
+    Sample,
+    find_samples,
+    refuse_standstill,
+    sample_variants,
+    takes_recorded_motion,
+)
 from cvcdepth_ros.training_data.samples import NetworkRig, ReadSample, SampleReader
+
+_OF_VARIANTS = 1
+"""Tells the draws of variants from those of the order."""
 
 
 class _EpochOrder:
@@ -55,13 +64,18 @@ class RecordingBatches:
         if config.depth.network == RIG_CONDITIONED:
             _refuse_unlikely_ground(indexes)
         refuse_standstill(indexes, config.recordings)
-        samples = [
-            sample
+        variants = [
+            sample_variants(index, config.recordings, sample)
             for recording, index in enumerate(indexes)
             for sample in find_samples(index, config.recordings, "training", recording)
         ]
-        self.reader = SampleReader(indexes, samples, config.depth.height, config.depth.width, config.recordings)
-        self._rig_groups = _group_by_rig(indexes, samples)
+        every = [sample for of_target in variants for sample in of_target]
+        self.reader = SampleReader(indexes, every, config.depth.height, config.depth.width, config.recordings)
+        self.targets = [of_target[0] for of_target in variants]
+        """The samples of an epoch, each with its nearest contexts."""
+        ends = np.cumsum([len(of_target) for of_target in variants])
+        self._variants = [range(end - len(of_target), end) for of_target, end in zip(variants, ends, strict=True)]
+        self._rig_groups = _group_by_rig(indexes, self.targets, config.recordings)
         self._processes = processes
         self._samples_together = config.optimizer.samples_per_batch * processes.count
         self._seed = config.seed
@@ -74,16 +88,25 @@ class RecordingBatches:
     @property
     def samples(self) -> int:
         """Samples of one epoch, of all processes together."""
-        return len(self.reader)
+        return len(self.targets)
 
     def epoch(self, number: int, first: int = 0) -> Iterator[RigBatch | None]:
         """Yield the batches of an epoch from the `first` on; None for one whose images are all damaged."""
         rank, count = self._processes.rank, self._processes.count
-        self._order.batches = [_at_least(together, count)[rank::count] for together in self._shuffled(number)[first:]]
+        drawn = self._drawn(number)
+        self._order.batches = [
+            [drawn[target] for target in _at_least(together, count)[rank::count]]
+            for together in self._shuffled(number)[first:]
+        ]
         yield from self._loader
 
+    def _drawn(self, epoch: int) -> list[int]:
+        """Return the place in the reader of the variant of each target that an epoch takes."""
+        generator = np.random.default_rng([self._seed, epoch, _OF_VARIANTS])
+        return [places[int(generator.integers(len(places)))] for places in self._variants]
+
     def _shuffled(self, epoch: int) -> list[list[int]]:
-        """Return the samples that go together through the networks of all processes."""
+        """Return the targets that go together through the networks of all processes."""
         generator = np.random.default_rng([self._seed, epoch])
         size = self._samples_together
         orders = [generator.permutation(group).tolist() for group in self._rig_groups]
@@ -93,11 +116,12 @@ class RecordingBatches:
 
 def _refuse_unrecorded_motion(indexes: Sequence[RecordingIndex], config: RecordingsConfig) -> None:
     without = [str(index.path) for index in indexes if index.poses is None]
-    if config.exposure_motion == "recorded" and without:
-        raise RecordingError(
-            f"{', '.join(without)}: no motion is recorded, but recordings.exposure_motion is 'recorded'; 'auto' takes "
-            "the pose network's there"
-        )
+    for name in ("motion", "exposure_motion"):
+        if getattr(config, name) == "recorded" and without:
+            raise RecordingError(
+                f"{', '.join(without)}: no motion is recorded, but recordings.{name} is 'recorded'; 'auto' takes "
+                "the pose network's there"
+            )
 
 
 def _refuse_unlikely_ground(indexes: Sequence[RecordingIndex]) -> None:
@@ -113,12 +137,14 @@ def _at_least(samples: list[int], count: int) -> list[int]:
     return list(islice(cycle(samples), max(count, len(samples))))
 
 
-def _group_by_rig(indexes: Sequence[RecordingIndex], samples: Sequence[Sample]) -> list[list[int]]:
-    """Return the samples' positions, those of equal rigs together."""
-    layouts = [index.layout for index in indexes]
+def _group_by_rig(
+    indexes: Sequence[RecordingIndex], samples: Sequence[Sample], config: RecordingsConfig
+) -> list[list[int]]:
+    """Return the samples' positions, those of equal rigs and of motion from the same source together."""
+    kinds = [(index.layout, takes_recorded_motion(index, config)) for index in indexes]
     groups: dict[int, list[int]] = {}
     for position, sample in enumerate(samples):
-        groups.setdefault(layouts.index(layouts[sample.recording]), []).append(position)
+        groups.setdefault(kinds.index(kinds[sample.recording]), []).append(position)
     return list(groups.values())
 
 
@@ -147,4 +173,5 @@ def _collate(rigs: Sequence[NetworkRig], items: Sequence[ReadSample | None]) -> 
         return None
     recordings, *columns = zip(*read, strict=True)
     rig: NetworkRig = rigs[recordings[0]]
-    return rig.batch(*(torch.from_numpy(np.stack(column)) for column in columns))
+    known = [column for column in columns if column[0] is not None]  # recorded poses, the last, may be unknown to all
+    return rig.batch(*(torch.from_numpy(np.stack(column)) for column in known))

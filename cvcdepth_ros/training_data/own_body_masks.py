@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -72,6 +73,7 @@ def find_self_occlusion(index: RecordingIndex) -> OwnBodies:
 
     Nothing is found where the vehicle hardly moves: fewer than `MIN_PAIRS` pairs of pictures.
     """
+    index = replace(index, layout=index.layout.model_copy(update={"aspect": "stretch"}))  # all of each picture
     finder = SelfOcclusionFinder(index.layout.complete())
     height, width = finder.preprocessor.valid.shape[1:]
     reader = SampleReader([index], [], height, width, RecordingsConfig(cache_mb=0))

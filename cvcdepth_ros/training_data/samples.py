@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from cvcdepth_core.errors import ImageError
+from cvcdepth_core.errors import ImageError, RecordingError
 from cvcdepth_core.images.decoding import Picture
 from cvcdepth_core.images.surround import SurroundPreprocessor
 from cvcdepth_core.rig.poses import inverse
@@ -24,10 +24,11 @@ from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_core.training.batch import RigBatch
 from cvcdepth_core.training.config import RecordingsConfig
 from cvcdepth_ros.bags import Recording, open_recording
-from cvcdepth_ros.messages.conversion import picture_from_message, stamp_ns
+from cvcdepth_ros.messages.conversion import stamp_ns
 from cvcdepth_ros.recently_used import RecentlyUsed
+from cvcdepth_ros.surround_sets.set_estimation import images_of
 from cvcdepth_ros.training_data.index import RecordingIndex
-from cvcdepth_ros.training_data.sample_choice import Sample
+from cvcdepth_ros.training_data.sample_choice import Sample, takes_recorded_exposures, takes_recorded_motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,11 +57,18 @@ class NetworkRig:
             tuple(rig.neighbour_indices),
         )
 
-    def batch(self, frames: Tensor, base_T_camera: Tensor, delays: Tensor, context_times: Tensor) -> RigBatch:
+    def batch(
+        self,
+        frames: Tensor,
+        base_T_camera: Tensor,
+        delays: Tensor,
+        context_times: Tensor,
+        recorded_poses: Tensor | None = None,
+    ) -> RigBatch:
         """Join what samples have of their own with the rig's constants.
 
-        That is pictures (uint8 [B, 3, N, H, W, 3], target first), poses [B, N, 4, 4] and the times of `ReadSample`. The
-        batch's poses have the ground at z = 0.
+        That is pictures (uint8 [B, 3, N, H, W, 3], target first), poses [B, N, 4, 4], times and recorded poses of
+        `ReadSample`. The batch's poses have the ground at z = 0.
         """
         samples = len(frames)
         masks = torch.from_numpy(self.preprocessor.valid).float()[:, None]
@@ -72,12 +80,13 @@ class NetworkRig:
             masks=masks.expand(samples, *masks.shape),
             intrinsics=intrinsics.expand(samples, *intrinsics.shape),
             base_T_camera=base_T_camera.float(),
-            targets=torch.tensor([target for target, _ in self.pairs]),
-            sources=torch.tensor([source for _, source in self.pairs]),
+            targets=torch.tensor([target for target, _ in self.pairs], dtype=torch.int64),
+            sources=torch.tensor([source for _, source in self.pairs], dtype=torch.int64),
             camera_names=self.names,
             anchor=self.anchor,
             exposure_delays=delays.float() if bool(delays.any()) else None,
             context_times=context_times.float(),
+            recorded_poses=None if recorded_poses is None else recorded_poses.float(),
         )
 
 
@@ -93,6 +102,9 @@ class ReadSample(NamedTuple):
     """[N] seconds from the anchor's exposure to each camera's that the poses do not contain yet."""
     context_times: NDArray[np.float64]
     """[2] seconds from the target to before and after."""
+    recorded_poses: NDArray[np.float64] | None
+    """[3, N, 4, 4] each camera's at target, before and after, in the base frame at the anchor's target exposure; None
+    where the losses take the pose network's motion."""
 
 
 class SampleReader(Dataset[ReadSample | None]):
@@ -112,7 +124,7 @@ class SampleReader(Dataset[ReadSample | None]):
         self.samples = list(samples)
         self.rigs = [NetworkRig.from_index(index, height, width) for index in indexes]
         self._indexes = list(indexes)
-        self._exposure_motion = config.exposure_motion
+        self._config = config
         self._cache: RecentlyUsed[tuple[int, int], NDArray[np.uint8]] = RecentlyUsed(config.cache_mb * 2**20)
         self._recordings: dict[int, Recording] = {}
 
@@ -126,7 +138,9 @@ class SampleReader(Dataset[ReadSample | None]):
         except ImageError:
             return None
         poses = self.camera_poses(sample.recording, sample.target)
-        return ReadSample(sample.recording, np.stack(frames), poses, *self.exposures(sample))
+        return ReadSample(
+            sample.recording, np.stack(frames), poses, *self.exposures(sample), self.recorded_poses(sample)
+        )
 
     def pictures(self, recording: int, row: int) -> NDArray[np.uint8]:
         """Return the rectified pictures [N, H, W, 3] of a set; ImageError names the camera of a damaged one."""
@@ -142,41 +156,60 @@ class SampleReader(Dataset[ReadSample | None]):
         The poses lead from frame to frame too: while the vehicle's velocity is constant, its motion between two sets
         is the same from any camera's exposure to its next.
         """
-        index, base_T_camera = self._indexes[recording], self.rigs[recording].base_T_camera
-        if self._exposure_motion not in ("auto", "recorded") or index.poses is None:
-            return base_T_camera
-        anchor_T_world = inverse(index.poses[row, index.anchor])
-        moved: NDArray[np.float64] = anchor_T_world @ index.poses[row] @ base_T_camera
-        return moved
+        if not takes_recorded_exposures(self._indexes[recording], self._config):
+            return self.rigs[recording].base_T_camera
+        poses: NDArray[np.float64] = self._poses_at(recording, [row])[0]
+        return poses
+
+    def recorded_poses(self, sample: Sample) -> NDArray[np.float64] | None:
+        """Return the recorded poses of `ReadSample`, or None."""
+        if not takes_recorded_motion(self._indexes[sample.recording], self._config):
+            return None
+        return self._poses_at(sample.recording, [sample.target, sample.before, sample.after])
+
+    def _poses_at(self, recording: int, rows: Sequence[int]) -> NDArray[np.float64]:
+        """Return the cameras' recorded poses [R, N, 4, 4] in some sets, in the base frame at the first one's anchor."""
+        index = self._indexes[recording]
+        if index.poses is None:
+            raise RecordingError(f"{index.path}: its index has no motion")
+        at_once = not takes_recorded_exposures(index, self._config)
+        world_T_base = index.poses[rows][:, index.anchor, None] if at_once else index.poses[rows]
+        anchor_T_world = inverse(index.poses[rows[0], index.anchor])
+        poses: NDArray[np.float64] = anchor_T_world @ world_T_base @ self.rigs[recording].base_T_camera
+        return poses
 
     def exposures(self, sample: Sample) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the delays [N] that the pose network's motion has to make good for, and the contexts' times [2], s."""
         index = self._indexes[sample.recording]
         times = (index.times - index.times[sample.target, index.anchor]) / NANOSECONDS
-        by_network = self._exposure_motion == "network" or (self._exposure_motion == "auto" and index.poses is None)
+        by_network = self._config.exposure_motion != "none" and not takes_recorded_exposures(index, self._config)
         delays = times[sample.target] if by_network else np.zeros(len(times[0]))
         return delays, times[[sample.before, sample.after], index.anchor]
 
     def _rectified(self, recording: int, row: int) -> Iterator[Picture]:
         messages = self._messages(recording, row)
         rig = self.rigs[recording]
-        for camera, (name, message) in enumerate(zip(rig.names, messages, strict=True)):
+        for name, message in zip(rig.names, messages, strict=True):
             if message is None:
                 raise ImageError(f"camera {name}: the image of set {row} is not found again in the recording")
-            reduction = rig.preprocessor.rectifiers[name].reduction
-            yield rig.preprocessor.rectify(camera, picture_from_message(message, name, reduction), reduction)
+        images = images_of(dict(zip(rig.names, messages, strict=True)))
+        for camera, name in enumerate(rig.names):
+            rectifier = rig.preprocessor.rectifiers[name]
+            yield rig.preprocessor.rectify(camera, images[name].decoded(name, rectifier), rectifier.reduction)
 
     def _messages(self, recording: int, row: int) -> list[Any]:
         """Return each camera's message of a set, None where the recording has it no more."""
         index, opened = self._indexes[recording], self._open(recording)
         log_times = index.log_times[row].tolist()
         topics = [camera.image_topic for camera in index.layout.cameras]
-        wanted = {(topic, time): camera for camera, (topic, time) in enumerate(zip(topics, log_times, strict=True))}
+        wanted: dict[tuple[str, int], list[int]] = {}
+        for camera, place in enumerate(zip(topics, log_times, strict=True)):
+            wanted.setdefault(place, []).append(camera)
         found: list[Any] = [None] * len(topics)
         for message in opened.messages(set(topics), min(log_times), max(log_times) + 1):
-            camera = wanted.get((message.topic, message.log_time))
-            if camera is not None:
-                content = opened.deserialize(message)
+            cameras = wanted.get((message.topic, message.log_time), ())
+            content = opened.deserialize(message) if cameras else None
+            for camera in cameras:
                 if stamp_ns(content) == index.stamps[row, camera]:
                     found[camera] = content
         return found

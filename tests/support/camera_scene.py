@@ -31,12 +31,12 @@ class Cameras:
 
     def __init__(self, graph: RosGraph) -> None:
         self._graph = graph
-        self._pictures: dict[str, list[Any]] = {name: [] for name in CAMERAS}
+        self.pictures: dict[str, list[Any]] = {name: [] for name in CAMERAS}
         self.infos: dict[str, Any] = {}
         for entry in recordings.sample_entries():
             name = entry.topic.split("/")[2] if entry.topic.startswith("/camera/") else ""
             if entry.type == "sensor_msgs/msg/CompressedImage":
-                self._pictures[name].append(deserialize_message(entry.cdr, CompressedImage))
+                self.pictures[name].append(deserialize_message(entry.cdr, CompressedImage))
             elif entry.type == "sensor_msgs/msg/CameraInfo":
                 self.infos[name] = deserialize_message(entry.cdr, CameraInfo)
         self.good_infos = dict(self.infos)
@@ -54,7 +54,7 @@ class Cameras:
         self._cycle += 1
         for number, name in enumerate(CAMERAS):
             stamp = 1000 * SECOND + self._cycle * SECOND // 10 + number * 1_000_000
-            image = copy.copy(self._pictures[name][self._cycle % 10])
+            image = copy.copy(self.pictures[name][self._cycle % 10])
             image.header = copy.deepcopy(image.header)
             image.header.stamp.sec, image.header.stamp.nanosec = divmod(stamp, SECOND)
             image = self.faults.get(name, lambda image: image)(image)

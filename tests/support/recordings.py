@@ -159,6 +159,17 @@ def restamped(entries: Iterable[Entry], topic: str, stamp: Callable[[int, int], 
     return changed(entries, topic, change)
 
 
+def thinned(entries: Iterable[Entry], every: int) -> list[Entry]:
+    """The same recording with every n-th image of each camera only."""
+    seen: Counter[str] = Counter()
+    kept = []
+    for entry in entries:
+        seen[entry.topic] += 1
+        if "/image_raw" not in entry.topic or (seen[entry.topic] - 1) % every == 0:
+            kept.append(entry)
+    return kept
+
+
 def with_gap(entries: Iterable[Entry], topic: str, first: int, last: int) -> Iterator[Entry]:
     """The same recording, in which the messages number `first` to `last` of one topic were lost."""
     number = itertools.count()

@@ -89,7 +89,7 @@ def slanted_plane(
     world_T_base = rigid(
         torch.eye(3, dtype=FLOAT64).expand(3, 3, 3), torch.cat([torch.zeros(1, 3, dtype=FLOAT64), step])
     )
-    return _seen_plane(world_T_base[:, None] @ base_T_camera, base_T_camera, height, width, tilt)
+    return seen_plane(world_T_base[:, None] @ base_T_camera, base_T_camera, height, width, tilt)
 
 
 def passed_plane(delays: tuple[float, float], velocity: float, yaw_rate: float = 0.0) -> PlaneScene:
@@ -103,7 +103,7 @@ def passed_plane(delays: tuple[float, float], velocity: float, yaw_rate: float =
     twist[0, 2], twist[2, 0], twist[0, 3] = yaw_rate, -yaw_rate, velocity
     times = torch.tensor([0.0, -1.0, 1.0], dtype=FLOAT64)[:, None] + torch.tensor(delays, dtype=FLOAT64)
     world_T_base = torch.linalg.matrix_exp(times[..., None, None] * twist)
-    scene = _seen_plane(world_T_base @ base_T_camera, base_T_camera, height=48, width=64, tilt=(0.25, 0.15))
+    scene = seen_plane(world_T_base @ base_T_camera, base_T_camera, height=48, width=64, tilt=(0.25, 0.15))
     batch = replace(
         scene.batch,
         exposure_delays=torch.tensor([delays], dtype=FLOAT64),
@@ -119,7 +119,7 @@ def _side_by_side(baseline: float, turn: float) -> Tensor:
     return rigid(axis_angle_to_rotation(inward), sideways).unsqueeze(0)
 
 
-def _seen_plane(
+def seen_plane(
     world_T_camera: Tensor, base_T_camera: Tensor, height: int, width: int, tilt: tuple[float, float]
 ) -> PlaneScene:
     """Render the plane from the poses [3, 2, 4, 4] at the frames 0, -1 and +1."""

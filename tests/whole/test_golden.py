@@ -17,16 +17,17 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from cvcdepth_core.networks import DepthNet, PoseNet, disparity_to_depth
+from cvcdepth_core.networks.mirroring import fuse_flipped, mirror, mirror_motion
 from cvcdepth_core.rendering.photometric import masked_mean, photometric_error, ssim_distance
 from cvcdepth_core.rendering.projection import back_project, rigid_inverse, transform
 from cvcdepth_core.rendering.view_synthesis import align_intensity, overlap_statistics, sample, warp_views
 from cvcdepth_core.scoring.ground_truth import downsample_ground_truth, sample_prediction
-from cvcdepth_core.scoring.metrics import METRIC_NAMES, fuse_flipped
+from cvcdepth_core.scoring.metrics import METRIC_NAMES
 from cvcdepth_core.scoring.scorer import DepthSamples, SurroundScorer
 from cvcdepth_core.scoring.scores import ALL, Score, ScoreSettings
 from cvcdepth_core.scoring.sparse_depth import SparseDepth
 from cvcdepth_core.training import objective
-from cvcdepth_core.training.augmentation import apply_changes, mirror, mirror_motion
+from cvcdepth_core.training.augmentation import apply_changes
 from cvcdepth_core.training.batch import RigBatch
 from cvcdepth_core.training.losses import auto_mask, smoothness
 from cvcdepth_core.training.motion import distribute_anchor_motion, motion_to_context, relative_poses

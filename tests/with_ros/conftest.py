@@ -7,9 +7,18 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import pytest
+from shared_memory import remove_what_nobody_uses
 
 if TYPE_CHECKING:
     from ros_graph import RosGraph
+
+
+@pytest.fixture(scope="session", autouse=True)
+def shared_memory() -> Iterator[None]:
+    """Begin and end without the shared memory of nodes that were killed, which fills the machine run by run."""
+    remove_what_nobody_uses()
+    yield
+    remove_what_nobody_uses()
 
 
 @pytest.fixture

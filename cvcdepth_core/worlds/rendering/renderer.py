@@ -18,6 +18,7 @@ from cvcdepth_core.worlds.shapes.meshes import Floats, Mesh
 from cvcdepth_core.worlds.world import SKY, Way, World
 
 _NEAR = 0.02  # metres: nothing is seen closer to the lens
+_LEAST_AHEAD = 1e-3  # of a ray's unit vector
 _SAMPLES_AT_ONCE = 262_144  # rays that are shaded at once, which bounds the memory for large pictures
 _BAND = 16  # rows of a rolling shutter that are drawn at once
 
@@ -87,7 +88,8 @@ class Renderer:
         normals = np.where(away[:, None], -normals, normals) * hit[:, None]
         shape = camera_rays.shape[1:]
         truth = Truth(
-            (distances + _NEAR).reshape(shape) * camera_rays[2],
+            # Depth is along the axis; a fisheye sees beyond 90 degrees from it.
+            np.where(camera_rays[2] > _LEAST_AHEAD, (distances + _NEAR).reshape(shape) * camera_rays[2], np.nan),
             np.where(hit, self.scene.faces.objects[faces], SKY).reshape(shape).astype(np.int32),
             (hit & self.scene.faces.moving[faces]).reshape(shape),
             normals.reshape(*shape, 3).astype(np.float32),

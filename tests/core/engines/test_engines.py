@@ -5,6 +5,7 @@ import copy
 import json
 import subprocess
 import sys
+import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import get_args
@@ -213,6 +214,28 @@ def test_auto_passes_over_an_engine_that_is_broken_and_says_so_in_one_line(
         for name in ("ncnn", "openvino")
     ]
     with pytest.raises(EngineError, match=r"libc\+\+\.so\.9"):
+        build_engine(network, spec, "cpu", "ncnn")
+
+
+@needs_ncnn
+@pytest.mark.parametrize("fault", ["cannot be imported", "nowhere to write"])
+def test_auto_goes_on_where_ncnn_is_broken_or_has_nowhere_to_write(
+    fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    monkeypatch.setattr(selection, "find_spec", lambda name: name == "ncnn" or None)
+    if fault == "cannot be imported":
+        monkeypatch.setitem(sys.modules, "ncnn", None)
+    else:
+        monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
+    network, spec = lively_network("resnet18"), spec_of("resnet18")
+    assert build_engine(network, spec, "cpu").name.startswith("torch ")
+    (record,) = caplog.records
+    place = "ncnn" if fault == "cannot be imported" else str(tmp_path / "gone")
+    found = record.getMessage()
+    assert found.startswith("backend auto: backend ncnn: cannot be made ready: ")
+    assert place in found.partition("ready:")[2]
+    assert "\n" not in found
+    with pytest.raises(EngineError, match="backend ncnn: cannot be made ready"):
         build_engine(network, spec, "cpu", "ncnn")
 
 

@@ -9,9 +9,8 @@ from solid_world import Rectangle, pose, street
 from surround_drive import Drive, Way, ring, straight
 
 from cvcdepth_core.refinement.alignment import AlignedMotion, AlignedSet, align, exponential, logarithm
-from cvcdepth_core.refinement.refiner import SurroundRefiner
+from cvcdepth_core.refinement.drive import DriveRefiner
 from cvcdepth_core.refinement.visual_odometry import VisualOdometry
-from cvcdepth_core.refinement.without_odometry import RefinerWithoutOdometry
 from cvcdepth_core.rig.poses import inverse
 
 MOUNTS = ring(4, 75)
@@ -151,15 +150,15 @@ def test_a_dead_camera_does_not_stop_odometry():
 
 def test_without_odometry_depth_becomes_as_good_as_the_scale_that_it_began_with():
     drive = Drive(STREET, MOUNTS, TURNING)
-    refiner = RefinerWithoutOdometry(SurroundRefiner([]), VisualOdometry())
+    refiner = DriveRefiner([])
     for number in range(5):
-        moment = drive.moment(0.1 * number)
+        moment = replace(drive.moment(0.1 * number), world_T_base=None)
         bent = moment.with_depth(moment.depth * BUMPS)
         refined = refiner.refine(bent)
     truth = moment.depth
-    before, after = (np.nanmedian(np.abs(found - truth) / truth) for found in (bent.depth, refined.depth))
+    before, after = (np.nanmedian(np.abs(found - truth) / truth) for found in (bent.depth, refined.depth.depth))
     assert after < 0.5 * before
-    assert refiner.motion.problem is None
-    assert misses(refiner.motion, TURNING)[0] < 0.15
+    assert refined.source == "alignment"
+    assert misses(refined.visual.aligned, TURNING)[0] < 0.15
     refiner.reset()
-    assert not refiner.refine(moment).confidence.any()
+    assert not refiner.refine(moment).depth.confidence.any()

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from scenes import ring_neighbours, ring_poses
 from torch import Tensor
 
+from cvcdepth_core.networks.mirroring import mirror_motion
 from cvcdepth_core.rendering.projection import (
     PROJECTION_EPSILON,
     Reprojection,
@@ -29,7 +30,6 @@ from cvcdepth_core.rendering.view_synthesis import (
     warp_by_depth,
     warp_views,
 )
-from cvcdepth_core.training.augmentation import mirror_motion
 from cvcdepth_core.training.motion import (
     distribute_anchor_motion,
     distribute_vehicle_motion,

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Colour jitter and mirroring: who shares a draw, what stays, what the coin decides."""
+"""Colour jitter and coins: who shares a draw, what stays."""
 
 import colorsys
 
 import torch
 
-from cvcdepth_core.engines.example_rigs import ring_of_cameras
 from cvcdepth_core.training.augmentation import (
     ColorJitterConfig,
     adjust_brightness,
@@ -15,8 +14,6 @@ from cvcdepth_core.training.augmentation import (
     apply_changes,
     draw_flips,
     jitter_colors,
-    mirror,
-    mirror_rig,
 )
 
 
@@ -76,49 +73,3 @@ def test_the_coin_is_fair_and_tossed_per_sample():
     flips = draw_flips([generator(seed) for seed in range(4000)])
     assert flips.dtype == torch.bool
     assert 0.45 < float(flips.float().mean()) < 0.55
-
-
-def test_mirroring_touches_only_the_samples_the_coin_names():
-    images = torch.rand(3, 2, 3, 4, 5)
-    mirrored = mirror(images, torch.tensor([True, False, True]))
-    assert torch.equal(mirrored[0], images[0].flip(-1))
-    assert torch.equal(mirrored[1], images[1])
-    assert torch.equal(mirrored[2], images[2].flip(-1))
-
-
-def test_the_mirrored_rig_sees_the_mirrored_world():
-    """A point on one side is seen where its mirror image on the other side is seen in the mirrored picture."""
-    rig = ring_of_cameras(64, 96).to(dtype=torch.float64)
-    intrinsics = rig.intrinsics.clone()
-    intrinsics[..., 0, 1], intrinsics[..., 0, 2] = 0.7, 30.0  # a skew, and a principal point aside
-    rig = rig._replace(intrinsics=intrinsics)
-    mirrored = mirror_rig(rig, torch.tensor([True]))
-    points = 10 * torch.randn(200, 3, generator=generator(), dtype=torch.float64)
-    other_side = points * points.new_tensor([1.0, -1.0, 1.0])
-    for camera in range(6):
-        pixels, depth = project(points, rig, camera)
-        seen, seen_depth = project(other_side, mirrored, camera)
-        torch.testing.assert_close(seen_depth, depth)
-        torch.testing.assert_close(seen[:, 0], 95 - pixels[:, 0])
-        torch.testing.assert_close(seen[:, 1], pixels[:, 1])
-
-
-def project(points: torch.Tensor, rig, camera: int) -> tuple[torch.Tensor, torch.Tensor]:
-    camera_T_base = torch.linalg.inv(rig.base_T_camera[0, camera])
-    in_camera = points @ camera_T_base[:3, :3].T + camera_T_base[:3, 3]
-    x, y, z = (in_camera @ rig.intrinsics[0, camera].T).T
-    return torch.stack([x / z, y / z], dim=1), z
-
-
-def test_the_mirrored_rig_could_be_built_and_mirrored_back_is_the_rig():
-    rig = ring_of_cameras(64, 96).to(dtype=torch.float64)
-    rig = rig._replace(masks=torch.rand(rig.masks.shape, generator=generator(), dtype=torch.float64))
-    both = rig._replace(**{name: torch.cat([part, part]) for name, part in rig._asdict().items()})
-    flips = torch.tensor([True, False])
-    mirrored = mirror_rig(both, flips)
-    torch.testing.assert_close(torch.linalg.det(mirrored.base_T_camera[..., :3, :3]), torch.ones(2, 6).double())
-    assert torch.equal(mirrored.images[0], rig.images[0].flip(-1))
-    assert torch.equal(mirrored.masks[0], rig.masks[0].flip(-1))
-    for one, back, plain in zip(mirrored, mirror_rig(mirrored, flips), both, strict=True):
-        assert torch.equal(one[1], plain[1])
-        torch.testing.assert_close(back, plain)

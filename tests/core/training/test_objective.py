@@ -16,11 +16,11 @@ from torch.nn import functional as F  # noqa: N812
 
 from cvcdepth_core.errors import ImageError, RigError
 from cvcdepth_core.networks import DepthNet, PoseNet, RigImages
+from cvcdepth_core.networks.mirroring import mirror_rig
 from cvcdepth_core.rendering.projection import back_project, rigid
 from cvcdepth_core.rendering.strips import Strips
 from cvcdepth_core.rendering.view_synthesis import sample, sampling_grid
 from cvcdepth_core.training import objective
-from cvcdepth_core.training.augmentation import mirror_rig
 from cvcdepth_core.training.batch import RigBatch
 from cvcdepth_core.training.model import SurroundModel, rig_images
 from cvcdepth_core.training.motion import distribute_anchor_motion, relative_poses

@@ -139,8 +139,8 @@ def without_index(path: Path) -> bytes:
 
 
 @pytest.mark.parametrize("name", ["drive.bag.active", "drive.bag"])
-@pytest.mark.parametrize("compression", [None, Writer.CompressionFormat.BZ2])
-def test_a_bag_that_was_never_closed_is_read_as_far_as_its_whole_chunks_go(name: str, compression, tmp_path: Path):
+@pytest.mark.parametrize("compression", [None, Writer.CompressionFormat.BZ2, Writer.CompressionFormat.LZ4])
+def test_a_bag_that_was_never_closed_is_read_as_far_as_its_messages_go(name: str, compression, tmp_path: Path):
     whole = small_rig.write_ros1(tmp_path / "a.bag", DRIVE, compression=compression)
     path = tmp_path / name
     path.write_bytes(without_index(whole)[: int(whole.stat().st_size * 0.6)])
@@ -149,7 +149,37 @@ def test_a_bag_that_was_never_closed_is_read_as_far_as_its_whole_chunks_go(name:
     assert len(messages) > len(EXPECTED) / 3
     assert messages == [message for message in EXPECTED if message in set(messages)]
     assert min(times) == BEGIN
-    assert f"{len(messages)} messages of the" in damage
+    told = re.search(
+        r"(\d+) messages of the \d+ chunks before it recovered(?:, and (\d+) of the one that is cut)?", damage
+    )
+    assert told
+    assert sum(map(int, filter(None, told.groups()))) == len(messages)
+
+
+def test_of_the_chunk_that_was_being_written_every_whole_message_is_read(tmp_path: Path):
+    path = small_rig.write_ros1(tmp_path / "a.bag", DRIVE, chunk_bytes=10**6)
+    content = without_index(path)
+    counts = []
+    for share in (0.2, 0.4, 0.7):
+        path.write_bytes(content[: int(len(content) * share)])
+        messages, damage = read(path)
+        assert messages == [message for message in EXPECTED if message in set(messages)]
+        assert f"0 messages of the 0 chunks before it recovered, and {len(messages)} of the one that is cut" in damage
+        counts.append(len(messages))
+    assert 0 < counts[0] < counts[1] < counts[2]
+
+
+@pytest.mark.parametrize("compression", [None, Writer.CompressionFormat.BZ2, Writer.CompressionFormat.LZ4])
+def test_a_chunk_whose_size_was_never_written_is_read(compression, tmp_path: Path):
+    path = small_rig.write_ros1(tmp_path / "a.bag", DRIVE, compression=compression, chunk_bytes=10**6)
+    content = bytearray(without_index(path))
+    size = content.index(b"size=", content.index(b"op=\x05")) + len(b"size=")
+    end = re.search(rb"(?s)....op=\x05.*?size=....", content).end()
+    data = int.from_bytes(content[end : end + 4], "little")
+    content[size : size + 4] = content[end : end + 4] = bytes(4)
+    path.write_bytes(content[: end + 4 + data])
+    messages, _ = read(path)
+    assert messages == EXPECTED
 
 
 def test_a_bag_without_index_that_is_whole_gives_everything_and_is_not_called_damaged(tmp_path: Path):
@@ -168,8 +198,8 @@ def test_a_copy_that_was_cut_has_an_index_that_leads_nowhere_and_is_read_too(tmp
     assert "cut or unreadable from byte" in damage
 
 
-def test_a_bag_cut_within_its_first_chunk_holds_nothing_and_says_so(tmp_path: Path):
+def test_a_bag_cut_within_its_first_message_holds_nothing_and_says_so(tmp_path: Path):
     path = small_rig.write_ros1(tmp_path / "a.bag", DRIVE, chunk_bytes=10**6)
-    path.write_bytes(path.read_bytes()[:9000])
+    path.write_bytes(path.read_bytes()[:4200])
     with pytest.raises(RecordingError, match=r"holds no readable message \(.*cut or unreadable from byte"):
         open_recording(path)

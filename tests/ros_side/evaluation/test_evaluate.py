@@ -90,6 +90,39 @@ def test_run_and_evaluate_give_the_same_depth_bit_for_bit(two_sets: Path, tmp_pa
         np.testing.assert_array_equal([depth[index] for depth in scored], stored)
 
 
+def test_run_and_evaluate_refine_the_same_sets_alike_bit_for_bit(tmp_path: Path):
+    recording = recordings.write_rosbag2(tmp_path / "four_sets", recordings.sample_entries(4))
+    settings = EvaluationSettings(untrained=True, height=64, width=96, refine="geometry")
+    with open_evaluation(EvaluationJob("four_sets", str(recording), settings)) as evaluation:
+        scored = [measured.estimated.result for measured in evaluation.sets(*evaluation.window)]
+    assert main(["run", str(recording), "-o", str(tmp_path / "depth"), *SMALL, "--refine", "geometry"]) == 0
+    told = json.loads((tmp_path / "depth" / "run.json").read_text())["refinement"]
+    assert told == {"motion": {"odometry": 4, "alignment": 0, "unknown": 0}, "odometry_problem": None}
+    for index, name in enumerate(CAMERAS):
+        for part, found in (("image_rect", [r.depth for r in scored]), ("confidence", [r.confidence for r in scored])):
+            stored = depth_images(tmp_path / "depth", f"/surround_depth/{name}/depth/{part}")
+            np.testing.assert_array_equal([values[index] for values in found], stored)
+    assert any(result.confidence.any() for result in scored)
+
+
+def test_confidence_is_scored_without_refinement_too_and_leaves_depth_as_it_is(two_sets: Path, tmp_path: Path):
+    plain = score(tmp_path / "plain", two_sets, *SMALL)
+    result = score(tmp_path / "sure", two_sets, *SMALL, "--confidence")
+    assert plain["confidence"] is None
+    assert result["scores"] == plain["scores"]
+    assert result["confidence"]["mean"]["abs_rel"] > result["confidence"]["mean"]["surest_half"] > 0
+    pixels = result["confidence"]["calibration"]["pixels"]
+    assert sum(pixels) > 1000
+    assert sum(count > 0 for count in pixels) > 2
+    again = score(tmp_path / "sure", two_sets, *SMALL, "--confidence")
+    assert again["confidence"] == result["confidence"]
+
+
+def test_a_reference_is_never_refined(two_sets: Path, tmp_path: Path):
+    result = score(tmp_path / "constant", two_sets, *CONSTANT, "--refine", "geometry")
+    assert result["recordings"][0]["refinement"] is None
+
+
 def depth_images(path: Path, topic: str) -> list[NDArray[np.float32]]:
     with AnyReader([path]) as reader:
         connections = [c for c in reader.connections if c.topic == topic]

@@ -142,3 +142,23 @@ def test_silence_while_nobody_could_listen_does_not_count():
     assert camera.state == CameraState.OK
     camera.now += 1.1
     assert camera.state == CameraState.STALE
+
+
+def test_a_refusal_is_forgotten_where_later_images_fit_no_set():
+    camera = Camera()
+    camera.send(5)
+    camera.watch.used("it was cut")
+    camera.send(25)
+    assert camera.state == CameraState.REJECTED
+    camera.send(10)
+    assert camera.state == CameraState.OK
+
+
+def test_a_refusal_stays_while_images_join_sets_and_wait_to_be_judged():
+    camera = Camera()
+    camera.send(5)
+    camera.watch.used("it was cut")
+    for joined in range(60):
+        camera.send()
+        camera.watch.unmatched(joined)
+    assert camera.state == CameraState.REJECTED

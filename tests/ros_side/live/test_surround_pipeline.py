@@ -26,8 +26,10 @@ from cvcdepth_ros.live.mailbox import Mailbox
 from cvcdepth_ros.live.picture_preparation import CameraImage
 from cvcdepth_ros.live.pipeline import SurroundPipeline
 from cvcdepth_ros.recordings.rig import discover_rig
+from cvcdepth_ros.settings import ModelSettings
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
-from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet, estimate_set, picture_or_error
+from cvcdepth_ros.surround_sets.refinement import RefinementStage
+from cvcdepth_ros.surround_sets.set_estimation import EncodedImage, EstimatedSet, estimate_set, picture_or_error
 from cvcdepth_ros.surround_sets.synchronizer import SurroundSynchronizer
 
 TIMEOUT = 60.0
@@ -84,7 +86,7 @@ class Slowed:
 class Running:
     """A pipeline and what came out of it."""
 
-    def __init__(self, layout: Any, predictor: Any, min_cameras: int = 0) -> None:
+    def __init__(self, layout: Any, predictor: Any, min_cameras: int = 0, refine: str = "off") -> None:
         self.published: list[EstimatedSet[CameraImage]] = []
         self.wanted = set(layout.names)
         self.watches = {name: CameraWatch(1000.0, 1.0) for name in layout.names}
@@ -99,11 +101,12 @@ class Running:
             self.published.append,
             lambda _: None,
             self.latencies,
+            RefinementStage(ModelSettings.model_validate({"refine": refine})),
         )
 
     def feed(self, images: list[tuple[str, Any]]) -> None:
         for camera, message in images:
-            self.pipeline.add(camera, message)
+            self.pipeline.add([camera], message)
 
     def wait(self, condition: Callable[[], object]) -> None:
         deadline = time.monotonic() + TIMEOUT
@@ -116,8 +119,8 @@ class Running:
 def start(layout) -> Iterator[Callable[..., Running]]:
     running: list[Running] = []
 
-    def begin(predictor: Any, min_cameras: int = 0) -> Running:
-        running.append(Running(layout, predictor, min_cameras))
+    def begin(predictor: Any, min_cameras: int = 0, refine: str = "off") -> Running:
+        running.append(Running(layout, predictor, min_cameras, refine))
         running[-1].pipeline.set_rig(layout.complete())
         return running[-1]
 
@@ -137,6 +140,18 @@ def test_what_comes_out_is_what_the_bag_tool_computes_to_the_bit(start, estimato
     expected = estimate_set(messages, surround, StageLatencies(), required=6)
     np.testing.assert_array_equal(first.result.depth, expected.depth)
     np.testing.assert_array_equal(first.result.pictures, expected.pictures)
+
+
+def test_refined_depth_of_one_subscribed_camera_is_what_it_is_when_all_are(start, estimator, layout, images):
+    found = []
+    for wanted in (set(layout.names), {"left"}):
+        running = start(estimator, refine="geometry")
+        running.wanted = wanted
+        running.feed(images[:12])
+        running.wait(lambda running=running: running.published)
+        found.append(running.published[0].result)
+    np.testing.assert_array_equal(found[0].depth, found[1].depth)
+    np.testing.assert_array_equal(found[0].confidence, found[1].confidence)
 
 
 def test_a_network_that_looks_at_all_cameras_gives_one_subscriber_what_it_gives_to_all(
@@ -193,6 +208,28 @@ def test_images_are_decoded_while_the_network_is_busy_with_the_set_before(start,
     decoded = running.latencies.summaries()["preprocess"].count
     running.feed(images[12:18])
     running.wait(lambda: running.latencies.summaries()["preprocess"].count >= decoded + 6)
+    assert not running.published
+
+
+def test_a_complete_set_is_decoded_where_the_network_will_be_free_before_the_next(
+    start, estimator, images, monkeypatch: pytest.MonkeyPatch
+):
+    """When its images came, the network was busy for longer than the next ones would need to come."""
+    slowed = Slowed(estimator)
+    running = start(slowed)
+    left = iter(images)
+
+    def feed_until(sets: int) -> None:
+        while running.mailbox.statistics().received < sets:
+            running.feed([next(left)])
+
+    is_free = lambda _: running.mailbox.statistics().received >= 2  # noqa: E731
+    monkeypatch.setattr(running.pipeline._pace, "is_free_within", is_free)
+    feed_until(sets=1)
+    assert slowed.entered.wait(TIMEOUT)
+    assert running.latencies.summaries()["preprocess"].count == 6
+    feed_until(sets=2)
+    running.wait(lambda: running.latencies.summaries()["preprocess"].count == 12)
     assert not running.published
 
 
@@ -420,7 +457,7 @@ class TooWide(Rectifier):
 def test_what_opencv_raises_costs_one_image_and_names_its_camera(layout, images):
     camera, message = images[0]
     calibration = next(c.calibration for c in layout.cameras if c.name == camera)
-    outcome = picture_or_error(message, camera, TooWide(calibration, 96, 160), StageLatencies())
+    outcome = picture_or_error(EncodedImage(message), camera, TooWide(calibration, 96, 160), StageLatencies())
     assert isinstance(outcome, ImageError)
     assert str(outcome).startswith(f"camera {camera}: error: OpenCV")
 

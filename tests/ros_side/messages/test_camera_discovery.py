@@ -4,6 +4,7 @@ import pytest
 from cvcdepth_ros.messages.camera_discovery import discover_cameras
 
 RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+VIDEO = "ffmpeg_image_transport_msgs/msg/FFMPEGPacket"
 
 
 def topics(*namespaces: str, **images: str) -> dict[str, str]:
@@ -42,9 +43,11 @@ def test_cameras_are_called_by_the_shortest_names_that_tell_them_apart(namespace
             "/cam/image_raw/compressed",
             False,
         ),
+        ({"image_raw__ffmpeg": VIDEO, "image_raw__compressed": COMPRESSED}, "/cam/image_raw/compressed", False),
+        ({"image_raw__ffmpeg": VIDEO}, "/cam/image_raw/ffmpeg", False),
     ],
 )
-def test_raw_pictures_come_before_compressed_and_unrectified_before_rectified(images, chosen, rectified):
+def test_raw_pictures_come_before_compressed_and_video_and_unrectified_before_rectified(images, chosen, rectified):
     (camera,) = discover_cameras(topics("/cam", **images))
     assert (camera.image_topic, camera.rectified) == (chosen, rectified)
 

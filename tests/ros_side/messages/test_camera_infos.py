@@ -184,6 +184,31 @@ def test_a_calibration_that_changes_and_returns_is_told_twice(tmp_path: Path):
     ]
 
 
+def test_a_calibration_that_is_another_one_for_a_moment_only_is_told(tmp_path: Path):
+    with open_recording(small_rig.write_drive(tmp_path, changing(zoomed, 5, 6))) as recording:
+        found = changes_of(recording)
+    assert [line.rpartition(", ")[2] for line in found] == [
+        "0.500 s after the beginning",
+        "0.600 s after the beginning",
+    ]
+
+
+def test_of_a_long_recording_a_few_moments_are_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("cvcdepth_ros.messages.recorded_changes._QUICKLY_READ_BYTES", 0)
+    with open_recording(small_rig.write_drive(tmp_path, changing(zoomed))) as recording:
+        (found,) = changes_of(recording)
+    assert found.endswith("0.700 s after the beginning")
+
+
+def test_a_calibration_that_changes_all_the_time_is_told_in_a_few_lines(tmp_path: Path):
+    drive, other = small_rig.entries(frames=40), small_rig.entries(frames=40, change=zoomed)
+    mixed = [odd if number % 2 else even for number, (even, odd) in enumerate(zip(drive, other, strict=True))]
+    with open_recording(small_rig.write_drive(tmp_path, mixed)) as recording:
+        found = [line for line in changes_of(recording) if line.startswith("camera port")]
+    assert len(found) == 10
+    assert re.fullmatch(r"camera port: its calibration changes \d+ times more", found[-1])
+
+
 def test_rounding_is_no_change(tmp_path: Path):
     def jitter(message: Any) -> None:
         message.k = message.k + np.array([0.01, 0, 0.01, 0, 0.01, 0, 0, 0, 0])

@@ -11,7 +11,10 @@ from numpy.typing import NDArray
 from recordings import CAMERAS
 from rosbags.highlevel import AnyReader
 
+from cvcdepth_core.rig.rig_file import load_rig_layout
 from cvcdepth_ros.bag_replay import main
+from cvcdepth_ros.messages.conversion import stamp_ns
+from cvcdepth_ros.surround_sets.synchronizer import SurroundSynchronizer
 
 pytest.importorskip("rclpy", reason="these tests need a ROS environment")
 
@@ -68,3 +71,51 @@ def test_run_and_the_live_node_give_the_same_depth_bit_for_bit(graph: RosGraph, 
         assert published[name]
         for stamp, depth in published[name].items():
             np.testing.assert_array_equal(depth, stored[stamp])
+
+
+def refined_live(graph: RosGraph, rig: Path, topics: list[str], sets: int) -> dict[str, list[Image]]:
+    """What a node that refines publishes, each set waited for, so that none is left out."""
+    tf2_msgs = pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not built here (make tf2_msgs)")
+    classes = {**CLASSES, "tf2_msgs/msg/TFMessage": tf2_msgs.TFMessage}
+    entries = [entry for entry in recordings.sample_entries(sets) if entry.type in classes]
+    latched = {"/tf_static"}
+    publishers = {
+        e.topic: graph.node.create_publisher(classes[e.type], e.topic, reliable(latched=e.topic in latched))
+        for e in entries
+    }
+    graph.subscribe(Image, *topics)
+    graph.start_node(rig=rig, untrained=True, refine="geometry", max_age=0.0, reliable=True, publish_tf=False, **SIZE)
+    graph.await_matches(publishers.values())
+    graph.spin_until(lambda: all(graph.node.count_publishers(topic) for topic in topics), "the node's outputs")
+    images = [entry for entry in entries if entry.type.endswith("CompressedImage")]
+    for entry in sorted(entries, key=lambda entry: "CameraInfo" not in entry.type):
+        if entry not in images:
+            publishers[entry.topic].publish(deserialize_message(entry.cdr, classes[entry.type]))
+    # Motion that comes after the first pictures would be another history.
+    graph.spin_until(lambda: graph.values("refinement").get("motion topic") == "/tf", "the motion")
+    matching: SurroundSynchronizer[None] = SurroundSynchronizer.from_layout(load_rig_layout(rig), 0.1)
+    done = 0
+    for entry in images:
+        message = deserialize_message(entry.cdr, classes[entry.type])
+        publishers[entry.topic].publish(message)
+        done += len(matching.add(entry.topic.split("/")[2], stamp_ns(message), None))
+        graph.spin_until(lambda done=done: all(len(graph.received[t]) >= done for t in topics), f"set {done}")
+    return {topic: graph.received[topic] for topic in topics}
+
+
+def test_run_and_the_live_node_refine_the_same_sets_alike_bit_for_bit(graph: RosGraph, tmp_path: Path):
+    sets = 5
+    rig, recording = tmp_path / "rig.yaml", tmp_path / "some_sets"
+    recordings.write_rosbag2(recording, recordings.sample_entries(sets))
+    assert main(["rig", str(recording), "-o", str(rig)]) == 0
+    options = ("--height", str(SIZE["height"]), "--width", str(SIZE["width"]), "--refine", "geometry")
+    run = ["run", str(recording), "-o", str(tmp_path / "depth"), "--untrained", "--rig", str(rig), *options]
+    assert main(run) == 0
+    topics = [f"/surround_depth/{name}/depth/{part}" for name in CAMERAS for part in ("image_rect", "confidence")]
+    for topic, images in refined_live(graph, rig, topics, sets).items():
+        stored, published = stored_depth(tmp_path / "depth", topic), by_stamp(images)
+        assert published.keys() == stored.keys()
+        for stamp, values in published.items():
+            np.testing.assert_array_equal(values, stored[stamp])
+        assert any(values.any() for values in published.values())
+    graph.await_status("refinement", "earlier pictures by odometry, and neighbours")

@@ -118,7 +118,7 @@ def test_that_nobody_subscribes_is_told_once(graph: RosGraph, rig: Path):
 
 
 def test_rig_auto_says_what_it_waits_for_and_since_when(graph: RosGraph):
-    pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not built here (make tf2_msgs)")
+    pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not built here (make messages)")
     graph.start_node(rig="auto", **SMALL)
     told = "rig auto: waiting for at least 1 camera with image and camera_info topics, found none; are the drivers"
     graph.spin_until(lambda: lines_with(graph, "WARN", told), "the warning")
@@ -206,7 +206,7 @@ class Tf:
     """What is on /tf_static, and somebody else who publishes there."""
 
     def __init__(self, graph: RosGraph) -> None:
-        self.messages = pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not built here (make tf2_msgs)")
+        self.messages = pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not built here (make messages)")
         self._graph = graph
         self.links: dict[str, list[tuple[str, float]]] = {}
         node, qos = graph.node, reliable(latched=True)

@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("rclpy", reason="these tests need a ROS environment")
 
 LOADING_TORCH = """
-import importlib, importlib.abc, os, sys
+import importlib.abc, os, sys
 
 class Watch(importlib.abc.MetaPathFinder):
     def find_spec(self, name, path=None, target=None):
@@ -18,11 +18,17 @@ class Watch(importlib.abc.MetaPathFinder):
             print("torch:", os.environ.get("GOMP_SPINCOUNT"))
 
 sys.meta_path.insert(0, Watch())
-importlib.import_module(sys.argv[1])
+exec(sys.argv[1])
 """
 
 
-@pytest.mark.parametrize("program", ["cvcdepth_ros.surround_depth_node", "cvcdepth_ros.bench.baseline_node"])
+@pytest.mark.parametrize(
+    "program",
+    [
+        "from cvcdepth_ros.surround_depth_node import main; main(['surround_depth_node', '--help'])",
+        "import cvcdepth_ros.bench.baseline_node",
+    ],
+)
 @pytest.mark.parametrize(("environment", "found"), [({}, "0"), ({"OMP_WAIT_POLICY": "active"}, "None")])
 def test_openmps_threads_sleep_in_the_node_unless_the_user_says_how_they_wait(program, environment, found):
     without = {name: value for name, value in os.environ.items() if not name.startswith(("GOMP", "OMP"))}

@@ -183,7 +183,7 @@ def test_nothing_is_inferred_while_nobody_subscribes(graph, messages, rig_conten
 
 
 def test_the_rig_is_found_among_the_live_topics(graph, messages):
-    tf2_msgs = pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not built here (make tf2_msgs)")
+    tf2_msgs = pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not built here (make messages)")
     feed = Feed(graph, messages)
     transforms = graph.node.create_publisher(tf2_msgs.TFMessage, "/tf_static", reliable(latched=True))
     transforms.publish(transform_message(tf2_msgs, messages))
@@ -194,7 +194,7 @@ def test_the_rig_is_found_among_the_live_topics(graph, messages):
 
 
 def test_a_rig_that_was_found_follows_later_calibrations(graph, messages):
-    tf2_msgs = pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not built here (make tf2_msgs)")
+    tf2_msgs = pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not built here (make messages)")
     spoiled = dict(messages)
     info = "/camera/left/camera_info"
     feed = Feed(graph, spoiled)
@@ -210,7 +210,7 @@ def test_a_rig_that_was_found_follows_later_calibrations(graph, messages):
 
 
 def test_one_camera_is_a_rig_too_after_it_has_been_alone_for_a_while(graph, messages):
-    tf2_msgs = pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not built here (make tf2_msgs)")
+    tf2_msgs = pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not built here (make messages)")
     feed = Feed(graph, {topic: found for topic, found in messages.items() if topic.startswith("/camera/left/")})
     transforms = graph.node.create_publisher(tf2_msgs.TFMessage, "/tf_static", reliable(latched=True))
     transforms.publish(transform_message(tf2_msgs, messages))
@@ -221,7 +221,7 @@ def test_one_camera_is_a_rig_too_after_it_has_been_alone_for_a_while(graph, mess
 
 
 def test_a_rig_is_not_settled_on_with_fewer_cameras_than_are_asked_for(graph, messages):
-    pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not built here (make tf2_msgs)")
+    pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not built here (make messages)")
     two = {topic: found for topic, found in messages.items() if topic.startswith(("/camera/front/", "/camera/left/"))}
     feed = Feed(graph, two)
     graph.start_node(rig="auto", min_cameras=4, **SMALL)
@@ -230,7 +230,7 @@ def test_a_rig_is_not_settled_on_with_fewer_cameras_than_are_asked_for(graph, me
 
 
 def test_a_found_rig_that_cannot_be_started_says_why_and_is_tried_again(graph, messages, tmp_path):
-    tf2_msgs = pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not built here (make tf2_msgs)")
+    tf2_msgs = pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not built here (make messages)")
     feed = Feed(graph, messages)
     transforms = graph.node.create_publisher(tf2_msgs.TFMessage, "/tf_static", reliable(latched=True))
     transforms.publish(transform_message(tf2_msgs, messages))
@@ -258,7 +258,7 @@ def test_an_impossible_image_topic_is_named(graph, rig_content, tmp_path):
 
 
 def test_a_camera_that_is_renamed_and_one_that_is_moved_are_followed(graph, messages, rig_content, tmp_path):
-    tf2_msgs = pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not built here (make tf2_msgs)")
+    tf2_msgs = pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not built here (make messages)")
     for camera in rig_content["cameras"]:
         del camera["base_T_camera"], camera["frame_id"]
     info, cloud = "/camera/left/camera_info", "/surround_depth/points"
@@ -287,7 +287,7 @@ def height_of(cloud: PointCloud2) -> float:
 
 
 def test_a_missing_transform_is_named_and_awaited(graph, messages, rig_content, tmp_path):
-    tf2_msgs = pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not built here (make tf2_msgs)")
+    tf2_msgs = pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not built here (make messages)")
     for camera in rig_content["cameras"]:
         del camera["base_T_camera"]
     feed = Feed(graph, messages)
@@ -304,7 +304,7 @@ def test_a_missing_transform_is_named_and_awaited(graph, messages, rig_content, 
 
 
 def test_transforms_that_make_no_tree_are_refused_by_name_and_the_others_taken(graph, messages, fault_table):
-    tf2_msgs = pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not built here (make tf2_msgs)")
+    tf2_msgs = pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not built here (make messages)")
     good = transform_message(tf2_msgs, messages)
     links = [("turntable", "turntable"), ("base_link", "rack"), ("rack", "base_link"), ("base_link", "n" * 300)]
     bad = [TransformStamped(child_frame_id=child, header=Header(frame_id=parent)) for parent, child in links]

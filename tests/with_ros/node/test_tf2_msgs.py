@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""tf2_msgs, built from its one-line definition (see tests/support/tf2_msgs), is a message like any other."""
+"""tf2_msgs, built from its one-line definition (see tests/support/message_packages), is a message like any other."""
 
 import os
 import subprocess

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Build tf2_msgs into the environment of the Python that runs this, and leave a stamp: `python build.py STAMP`.
+"""Build message packages that have no wheel into the environment of the Python that runs this: `python build.py STAMP`.
 
-The ROS 2 wheels have the generators, but not tf2_msgs. Without a compiler nothing is built, no stamp is left, and the
-tests that need it skip themselves.
+The ROS 2 wheels have the generators, but not the packages beside this file. Without a compiler nothing is built, no
+stamp is left, and the tests that need them skip themselves.
 """
 
 import os
@@ -42,7 +42,7 @@ def point_wheels_to_this_python() -> None:
             exported.write_text(text, encoding="utf-8")
 
 
-def cmake(*arguments: str) -> None:
+def cmake(package: str, *arguments: str) -> None:
     """Run this environment's CMake; its output is shown only if it fails."""
     environment = os.environ | {
         "PATH": f"{PREFIX / 'bin'}:{os.environ['PATH']}",
@@ -51,21 +51,28 @@ def cmake(*arguments: str) -> None:
     }
     done = subprocess.run(["cmake", *arguments], env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
-        sys.exit(f"{done.stdout}{done.stderr}\ntf2_msgs: cmake {' '.join(arguments)} failed")
+        sys.exit(f"{done.stdout}{done.stderr}\n{package}: cmake {' '.join(arguments)} failed")
+
+
+def build(package: Path) -> None:
+    """Configure, build and install one package."""
+    with tempfile.TemporaryDirectory() as folder:
+        python = f"-DPython3_EXECUTABLE={sys.executable}"
+        places = ("-S", str(package), "-B", folder, f"-DCMAKE_INSTALL_PREFIX={PREFIX}")
+        cmake(package.name, "-G", "Ninja", *places, python)
+        cmake(package.name, "--build", folder, "--target", "install")
+    print(f"{package.name}: built into {PREFIX}")
 
 
 def main() -> None:
-    """Configure, build and install, unless something is missing."""
+    """Build all packages, unless something is missing."""
     if missing := what_is_missing():
-        print(f"tf2_msgs: not built, this machine has no {missing}: the tests of /tf_static will be SKIPPED")
+        print(f"message packages: not built, this machine has no {missing}: the tests that need them will be SKIPPED")
         return
     point_wheels_to_this_python()
-    with tempfile.TemporaryDirectory() as build:
-        source, python = str(Path(__file__).parent), f"-DPython3_EXECUTABLE={sys.executable}"
-        cmake("-G", "Ninja", "-S", source, "-B", build, f"-DCMAKE_INSTALL_PREFIX={PREFIX}", python)
-        cmake("--build", build, "--target", "install")
+    for description in sorted(Path(__file__).parent.glob("*/package.xml")):
+        build(description.parent)
     Path(sys.argv[1]).touch()
-    print(f"tf2_msgs: built into {PREFIX}")
 
 
 if __name__ == "__main__":
