@@ -17,8 +17,8 @@ from cvcdepth_core.errors import ConfigError, ImageError
 from cvcdepth_core.model_choices import BACKENDS
 from cvcdepth_core.networks import DepthModelSpec, RigImages, build_depth_network, disparity_to_depth
 from cvcdepth_core.networks.checkpoint import load_checkpoint, save_checkpoint
+from cvcdepth_core.networks.mirroring import mirror_rig
 from cvcdepth_core.networks.rig_conditioned import CHANNELS, RigConditionedNet
-from cvcdepth_core.training.augmentation import mirror_rig
 
 FIELDS = {"encoder": "efficientnet_lite0", "height": 64, "width": 96, "min_depth": 0.4, "max_depth": 250.0}
 SPEC = DepthModelSpec(network="rig_conditioned", focal_scale=48.0, **FIELDS)
