@@ -35,7 +35,7 @@ _WHOLE_RIG = {
     "masks [1, N, 1, H, W] float32, 1 = scene",
     "output": "disparity [1, N, 1, H, W], float32 in (0, 1)",
 }
-_TOLD_ITS_RIG = {
+_TOLD_ITS_RIG: dict[str, Any] = {
     "input": "images [B, 3, H, W], float32 RGB in [0, 1], rectified; H and W multiples of 32; and conditioning "
     "[B, 11, H, W] float32, made once for each camera",
     "output": "disparity [B, 1, H, W], float32 in [0, 1], 0 in the sky",
