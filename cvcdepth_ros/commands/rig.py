@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--aspect", choices=get_args(Aspect),
-        help="how pictures come into a network of another shape: cut off, with empty borders, or stretched [crop]",
+        help="how pictures come into a network of another shape: rows cut off, with empty borders, or stretched [crop]",
     )  # fmt: skip
     parser.add_argument(
         "--ground-height",
@@ -90,7 +90,9 @@ def execute(arguments: argparse.Namespace) -> None:
         given = rig_layout(arguments)
         recorded = RecordedRig.from_recording(recording, given, arguments.base_frame)
         recorded = recorded if given is None else recorded.completed()
-        layout = _with_ground(_with_views(recorded.layout, arguments.view), arguments.ground_height)
+        if arguments.view:
+            recorded = recorded.with_layout(_with_views(recorded.layout, arguments.view)).completed()
+        layout = _with_ground(recorded.layout, arguments.ground_height)
         layout = layout.model_copy(
             update={
                 "anchor": _anchor(layout, arguments.anchor),
@@ -194,6 +196,12 @@ def _with_ground(layout: "RigLayout", height: float | None) -> "RigLayout":
 
 
 def _anchor(layout: "RigLayout", wanted: str | None) -> str:
+    """Return the camera that is asked for, of a lens with several views the middle one, else the rig's."""
+    from cvcdepth_core.rig.wide_lenses import from_left_to_right, lens_name
+
+    lenses = {lens_name(names): from_left_to_right(layout, names) for names in layout.views_by_image.values()}
+    if wanted in lenses:
+        return lenses[wanted][(len(lenses[wanted]) - 1) // 2]
     if wanted is not None and wanted not in layout.names:
         raise ConfigError(f"anchor: no camera is called {wanted}; there are {', '.join(layout.names)}")
     return wanted or layout.anchor_camera
