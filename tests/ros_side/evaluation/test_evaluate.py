@@ -41,7 +41,7 @@ from cvcdepth_ros.recordings.replay import DepthReplay
 from cvcdepth_ros.reports.shown_sets import chosen_sets
 
 SMALL = ("--untrained", "--height", "64", "--width", "96")
-CONSTANT = ("--predictor", "constant", "--height", "64", "--width", "96")
+CONSTANT = ("--predictor", "constant", "--height", "96", "--width", "160")
 FUSIONS = ((), ("--flip-fusion",), ("--flip-fusion", "--flip-fusion-of", "inverse_depth"))
 Rows = dict[tuple[str, int, str], dict[str, str]]
 
