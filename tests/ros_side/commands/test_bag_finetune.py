@@ -138,7 +138,7 @@ def test_the_scores_are_those_of_evaluate_on_the_held_out_part(better, tmp_path,
     cameras = metrics["scores"]["image"]["metric"]["cameras"]
     expected = {name: numbers["all"]["abs_rel"] for name, numbers in cameras.items()}
     found = {name: numbers["abs_rel"] for name, numbers in with_start["scores"]["after"]["cameras"].items()}
-    assert found.pop("back") == pytest.approx(expected.pop("back"), rel=1e-4)  # its roof is masked in the run
+    assert found.pop("back") == pytest.approx(expected.pop("back"), rel=1e-3)  # its roof is masked in the run
     assert found == pytest.approx(expected, rel=1e-6)
 
 
