@@ -69,7 +69,8 @@ class ObjectiveConfig(BaseModel):
     """How the neighbour's depth comes to the camera: dense backward warping (DDCL) or sparse splatting (DCL)."""
     corrected: bool = False
     """Depart from the published method: refuse points behind a camera, take the deviation for the intensity alignment
-    over the overlap only, average instead of add where two neighbours see the same pixel, binarise masks."""
+    over the overlap only, average instead of add where two neighbours see the same pixel, binarise masks, and leave
+    what they mask out of the smoothness."""
 
 
 @dataclass(frozen=True)
@@ -206,7 +207,8 @@ def _self_supervised_terms(
     if "reconstruction_consistency" in terms:
         terms["reconstruction_consistency"] = terms["reconstruction_consistency"].mean(dim=1)
     if config.smoothness > 0:
-        terms["smoothness"] = smoothness(prediction.disparity, batch.images)
+        shown = batch.masks if config.corrected else None
+        terms["smoothness"] = smoothness(prediction.disparity, batch.images, shown)
     if config.pose_consistency > 0:
         seen = motions_seen_from_anchor(prediction.motions, batch.base_T_camera, batch.anchor)
         terms["pose_consistency"] = pose_consistency(seen, batch.anchor)
