@@ -104,8 +104,8 @@ class RigLayout(BaseModel):
     anchor: str | None = None
     """The camera whose stamp a set carries and whose motion the pose network estimates; without it, the first."""
     aspect: Aspect = "crop"
-    """How pictures come into a network of another shape, by more than 10 %: what is too much is cut off (crop), borders
-    are left empty (pad), or pixels become wider or narrower than high (stretch)."""
+    """How pictures come into a network of another shape, by more than 10 %: rows that are too many are cut off (crop),
+    borders are left empty (pad), or pixels become wider or narrower than high (stretch)."""
     ground_height: float = Field(default=0.0, ge=-20, le=20, allow_inf_nan=False)
     """Metres of the ground in the base frame, below the vehicle as it stands; 0 where the base frame lies on the ground
     (REP 105's base_footprint), negative where it is higher. Networks that are told their rig need it."""

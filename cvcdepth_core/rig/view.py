@@ -92,8 +92,9 @@ def network_part(calibration: Calibration, height: int, width: int, aspect: Aspe
     """Return which part of the rectified picture a network's picture of `height` x `width` shows.
 
     Where resizing the whole picture would make pixels more than 10 % wider or narrower than high, they stay square:
-    `crop` cuts off what is too much, evenly at both sides, `pad` leaves borders without content. Else, and with
-    `stretch`, all of it is resized.
+    `crop` shows the whole width and cuts off rows above and below, evenly, `pad` shows all of it and leaves borders
+    without content. Columns are never cut off: they are what cameras share. A picture that is wider than the network's
+    is padded either way. Else, and with `stretch`, all of it is resized.
     """
     image_width, image_height = calibration.image_size
     K = calibration.rectified_intrinsics
@@ -101,7 +102,7 @@ def network_part(calibration: Calibration, height: int, width: int, aspect: Aspe
     focal_lengths = scales * K.diagonal()[:2]
     if aspect == "stretch" or max(focal_lengths) <= _SQUARE_ENOUGH * min(focal_lengths):
         return PicturePart(0.0, 0.0, image_width, image_height)
-    chosen = max(focal_lengths) if aspect == "crop" else min(focal_lengths)
+    chosen = focal_lengths[0] if aspect == "crop" else min(focal_lengths)
     shown = np.array([width, height]) / (scales * chosen / focal_lengths)
     left, top = (np.array([image_width, image_height]) - shown) / 2
     return PicturePart(float(left), float(top), *shown.tolist())

@@ -34,6 +34,7 @@ _MIN_CAMERA_HEIGHT = 0.5  # metres above the ground, where the base frame lies a
 _WINDOW = 9  # pixels over which changes are summed up
 _SEED_TEXTURE, _SEED_RATIO, _GROWN_RATIO = 0.7, 0.7, 1.5  # grey levels per pixel; change by change of one pixel's shift
 _LEAST_PERSISTENCE = 0.6  # share of a seed's texture that is left in the mean of the pictures; of scene 0.1 to 0.4
+_FADING_CHANGE, _FADING_PERSISTENCE = 0.2, 0.35  # grey levels; share of the texture: what is no body however smooth
 _NOISE_PERCENTILE = 5
 _MAX_NOISE = 0.5  # grey levels that may count as noise: where no body is seen, the stillest picture is of a road
 _MIN_SEED_SHARE = 0.002
@@ -105,11 +106,15 @@ class SelfOcclusionFinder:
             np.stack([cv2.blur(image / self.pairs, (_WINDOW, _WINDOW)) for image in sums])
             for sums in (self._changes, self._shift_changes, abs(self._slopes))
         )
-        ratios = np.maximum(changes - self._noise(changes), 0) / np.maximum(textures, 1e-3)
+        excess = np.maximum(changes - self._noise(changes), 0)
+        ratios = excess / np.maximum(textures, 1e-3)
         lasts = lasting > _LEAST_PERSISTENCE * textures
         seeds = self._examined & (textures > _SEED_TEXTURE) & (ratios < _SEED_RATIO) & lasts
-        grown = self._examined & (ratios < _GROWN_RATIO)
-        return np.stack([~_enclosed(_connected(*still)) for still in zip(grown, seeds, strict=True)])
+        # A smooth road, and the shadow on it of a vehicle that follows, change little, but not only by noise.
+        fades = (excess > _FADING_CHANGE) & (lasting < _FADING_PERSISTENCE * textures)
+        grown = self._examined & (ratios < _GROWN_RATIO) & ~fades
+        seen = self.preprocessor.valid
+        return np.stack([~_enclosed(_connected(*still)) for still in zip(grown, seeds, seen, strict=True)])
 
     def raw_mask(self, camera: int, scene: NDArray[np.bool_]) -> NDArray[np.uint8]:
         """Return `scene` [H, W] of a camera as a mask of its raw image's size: 0 on the vehicle, 255 elsewhere."""
@@ -146,21 +151,22 @@ def _smooth_grey(picture: Picture) -> NDArray[np.float32]:
     return grey
 
 
-def _connected(grown: NDArray[np.bool_], seeds: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the parts of `grown` that hold enough of `seeds`, at the picture's border too, with gaps closed."""
+def _connected(grown: NDArray[np.bool_], seeds: NDArray[np.bool_], seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the parts of `grown` that hold enough of `seeds`, at the border of what is `seen` too, gaps closed."""
     least = _MIN_SEED_SHARE * seeds.size
     still = _parts(grown, lambda part: int((part & seeds).sum()) >= least)
     closed = cv2.morphologyEx(still.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((_CLOSING, _CLOSING), np.uint8)) > 0
     # What floats inside the picture is a vehicle that drives along, not our own, even if a smooth road leads from it to
     # the border.
-    at_border = seeds & ~_inner(seeds.shape)
+    at_border = seeds & ~_inner(seen)
     return _parts(closed, lambda part: int((part & at_border).sum()) >= _MIN_BORDER_SEEDS)
 
 
-def _inner(shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Return what is not near the left, the right or the lower border."""
-    inner = np.zeros(shape, bool)
-    inner[:-_BORDER, _BORDER:-_BORDER] = True
+def _inner(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return what is not near the left, the right or the lower border of what the lens shows."""
+    inner = np.zeros_like(seen)
+    left, right = seen[:-_BORDER, : -2 * _BORDER], seen[:-_BORDER, 2 * _BORDER :]
+    inner[:-_BORDER, _BORDER:-_BORDER] = left & right & seen[_BORDER:, _BORDER:-_BORDER]
     return inner
 
 

@@ -28,15 +28,30 @@ def auto_mask(reprojection_error: Tensor, identity_error: Tensor) -> Tensor:
     return (reprojection_error <= identity_error).to(reprojection_error.dtype)
 
 
-def smoothness(disparity: Tensor, image: Tensor) -> Tensor:
+def smoothness(disparity: Tensor, image: Tensor, mask: Tensor | None = None) -> Tensor:
     """Return the edge-aware smoothness [...] of `disparity` [..., 1, H, W], relative to its mean.
 
-    Gradients count less where `image` [..., C, H, W] has an edge.
+    Gradients count less where `image` [..., C, H, W] has an edge. With a binary `mask` [..., 1, H, W], pixels that show
+    nothing have no part in it.
     """
+    if mask is not None:
+        return _smoothness_within(disparity, image, mask)
     relative = disparity / (disparity.mean(dim=(-2, -1), keepdim=True) + _EPSILON)
     along_x = relative.diff(dim=-1).abs() * _edge_weight(image, dim=-1)
     along_y = relative.diff(dim=-2).abs() * _edge_weight(image, dim=-2)
     return along_x.mean(_OVER_IMAGE) + along_y.mean(_OVER_IMAGE)
+
+
+def _smoothness_within(disparity: Tensor, image: Tensor, mask: Tensor) -> Tensor:
+    shown = mask.sum(dim=(-2, -1), keepdim=True).clamp(min=1)
+    relative = disparity / ((disparity * mask).sum(dim=(-2, -1), keepdim=True) / shown + _EPSILON)
+    total = torch.zeros(disparity.shape[:-3]).to(disparity)
+    for dim in (-1, -2):
+        size = mask.shape[dim] - 1
+        both = mask.narrow(dim, 0, size) * mask.narrow(dim, 1, size)
+        change = relative.diff(dim=dim).abs() * _edge_weight(image, dim) * both
+        total = total + change.sum(_OVER_IMAGE) / both.sum(_OVER_IMAGE).clamp(min=1)
+    return total
 
 
 def _edge_weight(image: Tensor, dim: int) -> Tensor:

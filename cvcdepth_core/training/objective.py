@@ -69,7 +69,8 @@ class ObjectiveConfig(BaseModel):
     """How the neighbour's depth comes to the camera: dense backward warping (DDCL) or sparse splatting (DCL)."""
     corrected: bool = False
     """Depart from the published method: refuse points behind a camera, take the deviation for the intensity alignment
-    over the overlap only, average instead of add where two neighbours see the same pixel, binarise masks."""
+    over the overlap only, average instead of add where two neighbours see the same pixel, binarise masks, and leave
+    what they mask out of the smoothness."""
 
 
 @dataclass(frozen=True)
@@ -206,7 +207,8 @@ def _self_supervised_terms(
     if "reconstruction_consistency" in terms:
         terms["reconstruction_consistency"] = terms["reconstruction_consistency"].mean(dim=1)
     if config.smoothness > 0:
-        terms["smoothness"] = smoothness(prediction.disparity, batch.images)
+        shown = batch.masks if config.corrected else None
+        terms["smoothness"] = smoothness(prediction.disparity, batch.images, shown)
     if config.pose_consistency > 0:
         seen = motions_seen_from_anchor(prediction.motions, batch.base_T_camera, batch.anchor)
         terms["pose_consistency"] = pose_consistency(seen, batch.anchor)
@@ -403,7 +405,7 @@ def _masked_errors(
     auto_masks = auto_mask(reprojection, _identity_error(batch, statistics, identity_noise)) * batch.masks
     errors = {"temporal": [MaskedError(reprojection, auto_masks)]}
     for part in overlap.parts:
-        for name, error in _overlap_errors(batch, part, auto_masks, config).items():
+        for name, error in _overlap_errors(batch, part, auto_masks, statistics, config).items():
             errors.setdefault(name, []).append(error)
     depth = overlap.depth
     if depth is not None:
@@ -413,12 +415,16 @@ def _masked_errors(
 
 
 def _overlap_errors(
-    batch: RigBatch, part: OverlapPart, auto_masks: Tensor, config: ObjectiveConfig
+    batch: RigBatch, part: OverlapPart, auto_masks: Tensor, of_targets: TargetStatistics, config: ObjectiveConfig
 ) -> dict[str, MaskedError]:
-    """Return those of the photometric terms of the overlap."""
+    """Return those of the photometric terms of the overlap.
+
+    `of_targets` are those of the whole images. What they see beyond a strip counts for its outermost columns alone,
+    where masks are zero.
+    """
     strips = part.strips
     target, own_masks = strips.cut(batch.images)[:, None], strips.cut(batch.masks)
-    statistics = TargetStatistics.from_images(target)
+    statistics = TargetStatistics(*(strips.cut(whole) for whole in of_targets))
     frames = [1, part.images.shape[1] - 1]
     spatial, spatio_temporal = part.images.split(frames, dim=1)  # type: ignore[no-untyped-call]
     spatial_mask = own_masks * part.masks[:, 0]

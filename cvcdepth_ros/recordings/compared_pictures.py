@@ -7,19 +7,22 @@ mounts that are judged.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from cvcdepth_core.errors import RigError
 from cvcdepth_core.estimator import DepthPredictor
 from cvcdepth_core.files import nan_to_null
 from cvcdepth_core.refinement.drive import DriveRefiner
 from cvcdepth_core.refinement.mounts import MountSearch, RefinedMounts
 from cvcdepth_core.refinement.settings import RefinementSettings
+from cvcdepth_core.rig.poses import Pose, inverse
 from cvcdepth_core.rig.rig import Rig
-from cvcdepth_core.rig.rig_file import PoseEntry, RigLayout
+from cvcdepth_core.rig.rig_file import CameraEntry, PoseEntry, RigLayout
 from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_ros.recordings.replay import DepthReplay, RecordedImage, SurroundReplay
 from cvcdepth_ros.recordings.rig import RecordedRig
@@ -54,6 +57,8 @@ class ComparedPictures:
     odometry_problem: str
     """What is wrong with recorded motion; empty where it fits, or there is none."""
     has_odometry: bool
+    has_judged_odometry: bool
+    """Whether there were enough sets in a row to know whether it fits."""
 
 
 def parts_of(start: int, stop: int, count: int, seconds: float) -> list[Part]:
@@ -71,27 +76,54 @@ def compare_pictures(
     matching: MatchingSettings,
     progress: Progress = lambda _: None,
 ) -> ComparedPictures:
-    """Look at the sets of these parts; RigError when there is none."""
+    """Look at the sets of these parts; RigError when there are too few."""
     rig = recorded.layout.complete()
     search = MountSearch(rig.neighbour_indices, rig.names.index(rig.anchor))
     problems: list[str] = []
-    sets = 0
+    sets, is_judged = 0, False
     for number, part in enumerate(parts):
         found = _Compared(recorded, predictor, matching, search)
         sets += found.look_at(part)
         problems += [found.problem] if found.problem else []
+        is_judged |= found.has_judged_odometry
         progress((number + 1) / len(parts))
-    has_odometry = recorded.vehicle_motion() is not None
-    return ComparedPictures(rig, sets, search.result(), problems[0] if problems else "", has_odometry)
+    if sets <= _WARM_UP:
+        raise RigError(
+            f"{recorded.recording.path}: {sets} sets, more than {_WARM_UP} in a row are needed to compare pictures"
+        )
+    problem = problems[0] if problems else ""
+    return ComparedPictures(rig, sets, search.result(), problem, recorded.vehicle_motion() is not None, is_judged)
 
 
 def turned_layout(layout: RigLayout, mounts: RefinedMounts) -> RigLayout:
-    """Return the layout, which is complete, with the mounts that were found."""
-    cameras = [
-        camera.model_copy(update={"base_T_camera": PoseEntry.from_matrix(pose)})
-        for camera, pose in zip(layout.cameras, mounts.base_T_camera, strict=True)
-    ]
-    return layout.model_copy(update={"cameras": tuple(cameras)})
+    """Return the layout, which is complete, with the mounts that were found; views of one lens turn together."""
+    rig, poses = layout.complete(), dict[int, Pose]()
+    for lens in rig.lenses:
+        turn = _mean_turn([mounts.base_T_camera[i] @ inverse(rig.cameras[i].base_T_camera) for i in lens])
+        for i in lens:
+            is_plain = len(lens) == 1 and layout.cameras[i].view is None
+            poses[i] = mounts.base_T_camera[i] if is_plain else _turned(layout.cameras[i], turn)
+    cameras = tuple(
+        camera.model_copy(update={"base_T_camera": PoseEntry.from_matrix(poses[i])})
+        for i, camera in enumerate(layout.cameras)
+    )
+    return layout.model_copy(update={"cameras": cameras})
+
+
+def _mean_turn(motions: Sequence[Pose]) -> NDArray[np.float64]:
+    """Return the rotation [3, 3] nearest to the mean of those of the poses (Moakher 2002)."""
+    u, _, v = np.linalg.svd(np.mean([motion[:3, :3] for motion in motions], axis=0))
+    turn: NDArray[np.float64] = u @ v
+    return turn
+
+
+def _turned(camera: CameraEntry, turn: NDArray[np.float64]) -> Pose:
+    """Return the pose of a lens, of which the camera is a view, turned in its place."""
+    if camera.base_T_camera is None:
+        raise RigError(f"camera {camera.name}: no base_T_camera")
+    pose = camera.base_T_camera.matrix(f"camera {camera.name}: base_T_camera")
+    pose[:3, :3] = turn @ pose[:3, :3]
+    return pose
 
 
 def mounts_to_json(rig: Rig, mounts: RefinedMounts) -> dict[str, Any]:
@@ -126,6 +158,10 @@ class _Compared:
         self._refiner = DriveRefiner(self._depths.surround.rig.neighbour_indices, grid)
         self._search = search
         self.problem = ""
+
+    @property
+    def has_judged_odometry(self) -> bool:
+        return self._refiner.has_judged_odometry
 
     def look_at(self, part: Part) -> int:
         """Search every second set; return how many there are."""

@@ -124,11 +124,24 @@ def test_smoothness_forgives_a_step_where_the_image_has_an_edge():
     assert float(smoothness(step, edge)) < float(smoothness(step, torch.zeros_like(edge)))
 
 
+def test_what_shows_nothing_has_no_part_in_the_smoothness():
+    disparity, image = (0.1 + images(1, 1, 6, 7)).requires_grad_(), images(1, 3, 6, 7, seed=1)
+    shown = torch.ones(1, 1, 6, 7, dtype=torch.float64)
+    shown[..., :, 5:] = 0
+    value = smoothness(disparity, image, shown)
+    torch.testing.assert_close(value, smoothness(disparity[..., :5], image[..., :5]))
+    (gradient,) = torch.autograd.grad(value.sum(), disparity)
+    assert (gradient[..., 5:] == 0).all()
+    torch.testing.assert_close(smoothness(disparity, image, torch.ones_like(shown)), smoothness(disparity, image))
+    assert float(smoothness(disparity, image, torch.zeros_like(shown)).detach()) == 0
+
+
 def test_losses_keep_every_leading_dimension():
     p, t = images(2, 3, 4, 3, 6, 7), images(2, 1, 4, 3, 6, 7)
     assert photometric_error(p, t).shape == (2, 3, 4, 1, 6, 7)
     assert masked_mean(photometric_error(p, t), torch.ones(2, 1, 4, 1, 6, 7)).shape == (2, 3, 4)
     assert smoothness(p[:, :, :, :1], p).shape == (2, 3, 4)
+    assert smoothness(p[:, :, :, :1], p, torch.ones(2, 1, 4, 1, 6, 7)).shape == (2, 3, 4)
 
 
 def test_pose_consistency_measures_metres_and_ten_times_radians():

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 pytest.importorskip("embreex", reason="worlds need embreex")
 
@@ -16,6 +17,7 @@ from cvcdepth_core.rig.poses import pose_from_quaternion
 from cvcdepth_core.rig.rig_file import load_rig_layout, save_rig_layout
 from cvcdepth_core.scoring.references import constant_depth
 from cvcdepth_core.training.config import RecordingsConfig
+from cvcdepth_core.training.objective import ObjectiveConfig, Prediction, evaluate_objective
 from cvcdepth_ros.bag_replay import main
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.messages import conversion
@@ -24,6 +26,7 @@ from cvcdepth_ros.recordings.rig import RecordedRig
 from cvcdepth_ros.settings import MatchingSettings
 from cvcdepth_ros.surround_sets import set_estimation
 from cvcdepth_ros.training_data.index import build_index
+from cvcdepth_ros.training_data.sample_choice import Sample
 from cvcdepth_ros.training_data.samples import SampleReader
 
 NAMES = [lens + view for lens in ("ahead", "port") for view in VIEWS]
@@ -110,7 +113,10 @@ def test_rig_writes_what_is_found(drive: Path, tmp_path: Path, capsys: pytest.Ca
 VIEW_OPTIONS = {
     "one angle for all": (["--view", "100"], {"ahead": 100.0, "port": 100.0}),
     "one of them": (["--view", "port=80"], {"ahead_l": 70.0, "ahead_m": 70.0, "ahead_r": 70.0, "port": 80.0}),
-    "a part in two": (["--view", "130", "--view", "port=90"], {"ahead_l": 75.0, "ahead_r": 75.0, "port": 90.0}),
+    "a part in two": (
+        ["--view", "130", "--view", "port=90", "--anchor", "ahead"],
+        {"ahead_l": 75.0, "ahead_r": 75.0, "port": 90.0},
+    ),
     "the whole lens": (["--view", "90", "--view", "lens"], dict.fromkeys(NAMES, 70.0)),
 }
 
@@ -119,6 +125,7 @@ VIEW_OPTIONS = {
 def test_rig_takes_as_much_of_each_lens_as_is_asked_for(options: list, views: dict, drive: Path, tmp_path: Path):
     assert main(["rig", str(drive), "-o", str(tmp_path / "rig.yaml"), *options]) == 0
     layout = load_rig_layout(tmp_path / "rig.yaml")
+    assert layout.anchor == next(name for name in ("ahead", "ahead_m", "ahead_l") if name in layout.names)
     assert {camera.name: camera.view.hfov for camera in layout.cameras} == {
         name: pytest.approx(hfov) for name, hfov in views.items()
     }
@@ -162,6 +169,23 @@ def test_views_are_trained_on_and_what_the_lens_does_not_see_is_masked(drive: Pa
     assert len({picture.tobytes() for picture in pictures}) == 6
     pairs = {(reader.rigs[0].names[a], reader.rigs[0].names[b]) for a, b in reader.rigs[0].pairs}
     assert {("ahead_l", "ahead_m"), ("ahead_l", "port_m")} <= pairs
+
+
+@pytest.mark.parametrize("corrected", [False, True])
+def test_views_of_one_lens_have_no_baseline_and_are_trained_on_all_the_same(drive: Path, corrected: bool):
+    index = build_index(drive, MatchingSettings())
+    reader = SampleReader([index], [Sample(0, 1, 0, 2)], 64, 96, RecordingsConfig(cache_mb=0))
+    columns = [column for column in reader[0][1:] if column is not None]
+    batch = reader.rigs[0].batch(*(torch.from_numpy(column[None]) for column in columns))
+    disparity = torch.rand(1, 6, 1, 64, 96).requires_grad_()
+    motions = torch.eye(4).expand(1, 2, 6, 4, 4).clone()
+    motions[..., 2, 3] = 0.3
+    prediction = Prediction(disparity, 2 + 10 * disparity, motions)
+    value = evaluate_objective(batch, prediction, ObjectiveConfig(corrected=corrected))
+    (gradient,) = torch.autograd.grad(value.loss, disparity)
+    assert torch.isfinite(value.per_sample).all()
+    assert torch.isfinite(gradient).all()
+    assert {"spatial", "depth_consistency"} <= value.terms.keys()
 
 
 def test_a_lens_whose_views_share_nothing_but_with_each_other_teaches_no_scale(drive: Path, tmp_path: Path):
