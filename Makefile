@@ -19,6 +19,7 @@ BESIDE := -n 2 --dist worksteal
 NODE_FAULTS := tests/with_ros/node/test_node_faults.py tests/with_ros/node/test_lifecycle.py \
   tests/with_ros/node/test_surround_depth_node.py::test_transforms_that_make_no_tree_are_refused_by_name_and_the_others_taken
 
+against = $$(case $$name in (training_step|node) echo --against $(AGAINST);; esac)
 BENCHMARKS := $(filter-out measuring table camera_loop,$(basename $(notdir $(wildcard benchmarks/*.py))))
 
 # A sourced ROS 2 installation must not leak into the wheels' environment, and nothing here talks to other machines.
@@ -36,10 +37,12 @@ help: ## list the targets
 demo: $(DEMO) ## play the sample recording to the live node over DDS; pictures and a table in output/demo
 	.venv/bin/python -m cvcdepth_ros.demo --output output/demo
 
-bench: $(DEV) ## run every benchmark, half an hour on a quiet machine; its table into docs/performance.md
+# Of the training step and of the node, the trainer and node of other checkouts are measured too (AGAINST=../of_yesterday).
+bench: $(DEV) ## run every benchmark, an hour on a quiet machine; its table into docs/performance.md (AGAINST=CHECKOUT)
 	@mkdir -p output/bench
 	@for name in $(BENCHMARKS); do \
-		echo "$$name ..." && .venv/bin/python benchmarks/$$name.py > output/bench/$$name.jsonl || exit 1; done
+		echo "$$name ..." && .venv/bin/python benchmarks/$$name.py $(if $(AGAINST),$(against)) \
+		  > output/bench/$$name.jsonl || exit 1; done
 	.venv/bin/python benchmarks/table.py $(BENCHMARKS:%=output/bench/%.jsonl)
 
 # The soak mostly waits, and asserts nothing about time.

@@ -7,7 +7,8 @@ Each engine has a process of its own, whose peak memory it is, and they take tur
 6 x 384 x 640 as torch runs it: all cameras as one batch, operation by operation, float32. `times_eager` compares with
 the same for the same network and size. The engines run in processes set up like those of node and bag tool, which keep
 freed buffers (`prepare_process`); "buffers kept" is the baseline in such a process. Weights are random: they change
-nothing about the speed.
+nothing about the speed. `gflop_per_cpu_s` is the work of the network as it was trained over the CPU time of all
+threads, `of_matrix_product` its ratio to what a thread reaches with large matrices, the limit of a core.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from measuring import Timings, json_lines, peak_memory_mb, print_line, times_quicker
+from measuring import Timings, json_lines, measure_in_turns, peak_memory_mb, print_line, times_quicker
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
@@ -85,6 +86,7 @@ def measured(network: tuple[str, int, int], options: argparse.Namespace) -> Iter
             timings[case].wall.append(wall)
             timings[case].cpu.append(cpu)
     memory = {case: worker.ask(finish=True) for case, worker in workers.items()}
+    work_flop, limit = floating_point_operations(network), gigaflops_of_matrix_product()
     names = {case: " ".join(map(str, case)) for case in cases}
     lines = json_lines("estimator", {names[case]: timings[case] for case in cases}, names[BASELINE], {}, options.device)
     for case, line in zip(cases, lines, strict=True):
@@ -96,10 +98,48 @@ def measured(network: tuple[str, int, int], options: argparse.Namespace) -> Iter
                 | {
                     "times_eager": round(times_quicker(timings[eager].wall, timings[case].wall), 3),
                     "times_eager_cpu": round(times_quicker(timings[eager].cpu, timings[case].cpu), 3),
+                    "gflop_per_cpu_s": round(work_flop / timings[case].median_cpu / 1e9, 1),
+                    "of_matrix_product": round(work_flop / timings[case].median_cpu / 1e9 / limit, 3),
                     "relative_depth_difference_p99.9": float(f"{difference(depths[case], depths[eager]):.2g}"),
                     "peak_memory_mb": round(memory[case]),
                 }
             )
+
+
+def floating_point_operations(network: tuple[str, int, int]) -> float:
+    """Return what the convolutions of the network as it was trained ask for, for all cameras.
+
+    An engine that rewrites it, or convolves by Winograd's method, computes less.
+    """
+    import torch
+    from torch import nn
+
+    from cvcdepth_core.networks import DepthNet
+
+    encoder, height, width = network
+    done: list[float] = []
+
+    def count(layer: nn.Module, _: object, output: torch.Tensor) -> None:
+        done.append(2.0 * output.numel() * layer.weight[0].numel())  # type: ignore[operator,union-attr,index]
+
+    counted = DepthNet(encoder).eval()
+    for layer in counted.modules():
+        if isinstance(layer, nn.Conv2d):
+            layer.register_forward_hook(count)
+    with torch.inference_mode():
+        counted.disparity(torch.zeros(1, 3, height, width))
+    return CAMERAS * sum(done)
+
+
+def gigaflops_of_matrix_product(size: int = 1024, rounds: int = 7) -> float:
+    """Return how many GFLOP one thread does in a second of CPU time where it only multiplies float32 matrices."""
+    import torch
+
+    threads, matrix = torch.get_num_threads(), torch.rand(size, size)
+    torch.set_num_threads(1)
+    timings = measure_in_turns({"": lambda: matrix @ matrix}, rounds)[""]
+    torch.set_num_threads(threads)
+    return 2e-9 * size**3 / timings.median_cpu
 
 
 def engines(device: str) -> list[str]:

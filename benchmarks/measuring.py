@@ -16,6 +16,8 @@ import os
 import platform
 import resource
 import statistics
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -32,6 +34,11 @@ class Timings:
     wall: list[float] = field(default_factory=list)
     cpu: list[float] = field(default_factory=list)
     """Of this process, all threads together: what tells more where others use the machine too."""
+
+    @property
+    def median_cpu(self) -> float:
+        """Seconds of CPU time."""
+        return statistics.median(self.cpu)
 
     def add(self, work: Callable[[], object]) -> None:
         """Run it once and note what it took."""
@@ -56,6 +63,18 @@ def measure_in_turns(cases: Mapping[str, Callable[[], object]], rounds: int, war
     return timings
 
 
+@contextlib.contextmanager
+def busy_processes(count: int) -> Iterator[None]:
+    """Have so many processes do nothing but use a processor, beside what the block measures."""
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
+
+
 def json_lines(
     benchmark: str, timings: Mapping[str, Timings], baseline: str, sizes: Mapping[str, Any], device: str = "cpu"
 ) -> Iterator[dict[str, Any]]:
@@ -70,7 +89,7 @@ def json_lines(
             "case": name,
             **sizes,
             **summary(measured.wall),
-            "cpu_ms": round(1e3 * statistics.median(measured.cpu), 3),
+            "cpu_ms": round(1e3 * measured.median_cpu, 3),
             "baseline": baseline,
             "times_baseline": round(times_quicker(timings[baseline].wall, measured.wall), 3),
             "times_baseline_cpu": round(times_quicker(timings[baseline].cpu, measured.cpu), 3),

@@ -4,10 +4,13 @@
     python benchmarks/training_step.py
     python benchmarks/training_step.py --sizes 384x640 --against ../main_of_yesterday
     python benchmarks/training_step.py --device cuda --samples 4
+    python benchmarks/training_step.py --threads 2 --busy 2
 
 "step" is the trainer's own, in a process that is set up as `finetune` sets itself up; the baseline is the same step as
 one writes it at first: one view after the other (camera_loop.py), plain Adam, the allocator as it comes. "networks" and
 "objective" are the parts of our step. `--against` names checkouts of other commits, whose trainers make steps too.
+
+`GOMP_SPINCOUNT=100000` in the environment lets idle threads spin, which `finetune` does not.
 
 Every measurement has a process of its own, for the peak memory is its; cases take turns. Depth begins at 10 m: with the
 1 to 2 m of random weights, neighbouring cameras would have nothing in common.
@@ -28,7 +31,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from measuring import Timings, json_lines, peak_memory_mb, print_line
+from measuring import Timings, busy_processes, json_lines, peak_memory_mb, print_line
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -59,9 +62,10 @@ def main() -> None:
     if options.case:
         print_line(measured_here(options))
         return
-    for size in options.sizes:
-        for line in compared(size, options):
-            print_line(line)
+    with busy_processes(options.busy):
+        for size in options.sizes:
+            for line in compared(size, options):
+                print_line(line)
 
 
 def parse_options() -> argparse.Namespace:
@@ -76,6 +80,7 @@ def parse_options() -> argparse.Namespace:
     )
     parser.add_argument("--threads", type=int, default=1, help="CPU threads")
     parser.add_argument("--against", nargs="+", type=Path, default=[], metavar="CHECKOUT", help="other commits")
+    parser.add_argument("--busy", type=int, default=0, help="foreign processes that use a processor each meanwhile")
     parser.add_argument("--case", help=argparse.SUPPRESS)  # what a process measures for the one that started it
     return parser.parse_args()
 
@@ -93,6 +98,7 @@ def compared(size: str, options: argparse.Namespace) -> Iterator[dict[str, Any]]
             timings[case].cpu.append(found["cpu"])
             peaks[case] = max(peaks[case], found["peak_memory_mb"])
     sizes = {"size": size, **{name: getattr(options, name) for name in ("samples", "encoder", "pose_method", "device")}}
+    sizes["foreign processes"] = options.busy
     for line in json_lines("training_step", timings, BASELINE, sizes, options.device):
         yield line | {"peak_memory_mb": round(peaks[line["case"]]), "threads": options.threads}
 
@@ -103,7 +109,9 @@ def measured_there(case: str, checkout: Path, size: str, options: argparse.Names
     arguments = [f"--{name.replace('_', '-')}={getattr(options, name)}" for name in passed]
     finished = subprocess.run(
         [sys.executable, __file__, f"--case={case}", f"--sizes={size}", *arguments],
-        env=os.environ | {"PYTHONPATH": str(checkout), "OMP_NUM_THREADS": str(options.threads), "GOMP_SPINCOUNT": "0"},
+        env={"GOMP_SPINCOUNT": "0"}
+        | os.environ
+        | {"PYTHONPATH": str(checkout), "OMP_NUM_THREADS": str(options.threads)},
         stdout=subprocess.PIPE,
         check=True,
     )

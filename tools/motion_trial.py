@@ -26,6 +26,7 @@ from cvcdepth_core.training.run_folder import CHECKPOINT_FILE
 
 PROMOTED, NOT_PROMOTED = 0, 3
 FAR = ("20-40", "40-80")
+SHIPPED = Path(__file__).parent.parent / "config" / "training" / "finetune.yaml"
 
 
 class Arm(NamedTuple):
@@ -75,7 +76,16 @@ def train(options: argparse.Namespace, arm: Arm, seed: int, folder: Path) -> Non
     """Fine-tune to the configured end; nothing happens where that is reached."""
     if (folder / "finetune.json").exists():
         return
-    changes = {
+    folder.mkdir(parents=True, exist_ok=True)
+    config = folder / "training.yaml"
+    config.write_text(yaml.safe_dump(training_file(options, arm, seed)), encoding="utf-8")
+    start = ["--from", "default", "--config", str(config), "--skip", "places"]
+    command("finetune", options.recording, arm.rig, *start, "-o", str(folder), allowed=(PROMOTED, NOT_PROMOTED))
+
+
+def training_file(options: argparse.Namespace, arm: Arm, seed: int) -> dict[str, Any]:
+    """Return the content of a run's training file."""
+    return {
         "base": str(options.config.resolve()),
         "recordings": {"motion": arm.motion},
         "optimizer": {"epochs": options.epochs, "decay_after_epochs": options.epochs, "autocast": "auto"},
@@ -83,11 +93,6 @@ def train(options: argparse.Namespace, arm: Arm, seed: int, folder: Path) -> Non
         "validate_every": options.epochs,
         "seed": seed,
     }
-    folder.mkdir(parents=True, exist_ok=True)
-    config = folder / "training.yaml"
-    config.write_text(yaml.safe_dump(changes), encoding="utf-8")
-    start = ["--from", "default", "--config", str(config), "--skip", "places"]
-    command("finetune", options.recording, arm.rig, *start, "-o", str(folder), allowed=(PROMOTED, NOT_PROMOTED))
 
 
 def scored(options: argparse.Namespace, checkpoint: str, folder: Path) -> Row:
@@ -111,7 +116,7 @@ def command(name: str, recording: str, rig: Path | None, *options: str, allowed:
 def row(metrics: Mapping[str, Any]) -> Row:
     """Return the numbers of a metrics.json."""
     image = metrics["scores"]["image"]["metric"]["mean"]
-    pose = metrics.get("pose_network") or {"ratio": float("nan"), "degrees": float("nan")}
+    pose = metrics["pose_network"]
     scale = geometric_mean(metrics["scale_ratio"]["image"].values())
     return Row(image["all"]["abs_rel"], far(image), scale, pose["ratio"], pose["degrees"])
 
@@ -142,8 +147,7 @@ def parse_options() -> argparse.Namespace:
     parser.add_argument("recording")
     parser.add_argument("--rig", type=Path, help="rig file, for training and scores [the cameras found]")
     parser.add_argument("--other-rig", type=Path, help="rig file with other mounts, for further runs")
-    shipped = Path(__file__).parent.parent / "config" / "training" / "finetune.yaml"
-    parser.add_argument("--config", type=Path, default=shipped, help="what all runs have in common [finetune.yaml]")
+    parser.add_argument("--config", type=Path, default=SHIPPED, help="what all runs have in common [finetune.yaml]")
     parser.add_argument("--epochs", type=int, default=8, help="of each run [8]")
     parser.add_argument("--seeds", type=int, default=3, help="runs of each way [3]")
     parser.add_argument("--start", type=float, default=2.93, help="second at which the held-out sets begin [2.93]")

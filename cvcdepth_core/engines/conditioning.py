@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -10,29 +12,35 @@ from cvcdepth_core.networks import ConditionedNetwork, RigImages
 
 _KEPT = 32  # cameras; a rig that changes for ever does not fill the memory
 
+Made = tuple[Tensor, ...]
+"""[M, ...] each, of M cameras."""
 
-class KeptConditioning:
-    """The conditioning of the cameras that were asked for last; of each camera on its own, to the last bit."""
 
-    def __init__(self, network: ConditionedNetwork) -> None:
-        self._network = network
-        self._kept: dict[bytes, Tensor] = {}
+class KeptForRig:
+    """What is made of calibrations, of the cameras that were asked for last; of each on its own, to the last bit."""
+
+    def __init__(self, make: Callable[[RigImages], Made]) -> None:
+        self._make = make
+        self._kept: dict[bytes, Made] = {}
 
     @torch.inference_mode()
-    def __call__(self, rig: RigImages) -> Tensor:
-        """Return [B*N, C, H, W] of a rig's cameras."""
+    def __call__(self, rig: RigImages) -> Made:
+        """Return what is made of each of a rig's B * N cameras, joined."""
         samples, cameras = rig.images.shape[:2]
         each = [rig.of_cameras([camera]) for camera in range(cameras)]
-        parts = [RigImages(*(part[b : b + 1] for part in one)) for b in range(samples) for one in each]
-        return torch.cat([self._of_camera(part) for part in parts])
+        alone = [RigImages(*(part[b : b + 1] for part in one)) for b in range(samples) for one in each]
+        return tuple(torch.cat(parts) for parts in zip(*map(self._of_camera, alone), strict=True))
 
-    def _of_camera(self, rig: RigImages) -> Tensor:
+    def _of_camera(self, rig: RigImages) -> Made:
         size = torch.tensor(rig.images.shape[-2:])
-        key = b"".join(p.cpu().numpy().tobytes() for p in (size, rig.intrinsics, rig.base_T_camera))
-        found = self._kept.pop(key, None)
-        if found is None:
-            found = self._network.conditioning(rig).flatten(0, 1)
+        key = b"".join(part.cpu().numpy().tobytes() for part in (size, rig.intrinsics, rig.base_T_camera))
+        found = self._kept.pop(key, None) or self._make(rig)
         self._kept[key] = found  # at the end: the first is the one that was not asked for longest
         if len(self._kept) > _KEPT:
             del self._kept[next(iter(self._kept))]
         return found
+
+
+def conditioning_of(network: ConditionedNetwork) -> Callable[[RigImages], Made]:
+    """Return what makes the conditioning [M, C, H, W]."""
+    return lambda rig: (network.conditioning(rig).flatten(0, 1),)

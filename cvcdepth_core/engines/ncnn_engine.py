@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -11,13 +12,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from cvcdepth_core.engines.conditioning import KeptForRig
 from cvcdepth_core.engines.engine import image_by_image
 from cvcdepth_core.engines.ncnn_graph import INPUT, OUTPUT, ncnn_model
 from cvcdepth_core.engines.rewriting import RewrittenDepthNet
+from cvcdepth_core.engines.rewriting_conditioned import RewrittenRigConditionedNet, ToldConstants
 from cvcdepth_core.errors import EngineError
 from cvcdepth_core.networks import DepthNet, RigImages
+from cvcdepth_core.networks.rig_conditioned import RigConditionedNet
 
 
 class NcnnEngine:
@@ -29,35 +33,42 @@ class NcnnEngine:
     device = torch.device("cpu")
     chunk = None
 
-    def __init__(self, network: DepthNet) -> None:
+    def __init__(self, network: DepthNet | RigConditionedNet) -> None:
         import ncnn
 
         self._ncnn = ncnn
         self.name = f"ncnn {ncnn.__version__} float32"
         self._threads = self._threads_per_image = torch.get_num_threads()
         self._pool = ThreadPoolExecutor(self._threads, "ncnn")
-        self._model = ncnn_model(RewrittenDepthNet(network, transposed=False))
+        self._model = ncnn_model(self._graph(network))
         self._net = self._load()
 
     def disparity(self, rig: RigImages) -> Tensor:
         """See `DisparityEngine`. The largest set so far decides how many threads each image has."""
-        return image_by_image(self._each, rig)
+        return image_by_image(lambda images: self._each({INPUT: images}), rig)
 
-    def _each(self, images: Tensor) -> Tensor:
-        threads = max(1, self._threads // len(images))
+    def _graph(self, network: Any) -> nn.Module:
+        return RewrittenDepthNet(network, transposed=False)
+
+    def _each(self, inputs: Mapping[str, Tensor]) -> Tensor:
+        """Return the output of each image and of what belongs to it."""
+        images = len(inputs[INPUT])
+        threads = max(1, self._threads // images)
         if threads < self._threads_per_image:
             self._threads_per_image = threads
             self._net = self._load()
-        return torch.from_numpy(np.stack(list(self._pool.map(partial(self._one, self._net), images.numpy()))))
+        each = [{name: values[i].numpy() for name, values in inputs.items()} for i in range(images)]
+        return torch.from_numpy(np.stack(list(self._pool.map(partial(self._one, self._net), each))))
 
-    def _one(self, net: Any, image: np.ndarray) -> np.ndarray:
+    def _one(self, net: Any, inputs: Mapping[str, np.ndarray]) -> np.ndarray:
         extractor = net.create_extractor()
-        # A Mat made from an array does not keep it alive, which it has to be until the clone has memory of its own.
-        contiguous = np.ascontiguousarray(image)
-        extractor.input(INPUT, self._ncnn.Mat(contiguous).clone())
+        for name, values in inputs.items():
+            # A Mat made from an array does not keep it alive, which it has to be until the clone has memory of its own.
+            contiguous = np.ascontiguousarray(values)
+            extractor.input(name, self._ncnn.Mat(contiguous).clone())
         failed, disparity = extractor.extract(OUTPUT)
         if failed:
-            raise EngineError(f"{self.name}: inference failed with code {failed} on an image of {image.shape}")
+            raise EngineError(f"{self.name}: inference failed with code {failed} on an image of {inputs[INPUT].shape}")
         return np.array(disparity)
 
     def _load(self) -> Any:
@@ -78,3 +89,25 @@ class NcnnEngine:
         if failed:
             raise EngineError(f"{self.name}: cannot load the network, code {failed}")
         return net
+
+
+class ConditionedNcnnEngine(NcnnEngine):
+    """The network that is told its rig: NCNN is given what is made of each calibration once, beside the picture."""
+
+    def __init__(self, network: RigConditionedNet) -> None:
+        super().__init__(network)
+        constants = ToldConstants(network)
+        self._network = network
+        self._told = KeptForRig(lambda rig: constants(network.conditioning(rig).flatten(0, 1)))
+
+    def disparity(self, rig: RigImages) -> Tensor:
+        """See `DisparityEngine`."""
+        *told, ground = self._told(rig)
+        inputs = dict(zip(ToldConstants.names, told, strict=True))
+        with torch.inference_mode():
+            return image_by_image(
+                lambda images: self._network.from_head(self._each({INPUT: images, **inputs}), ground).disparity, rig
+            )
+
+    def _graph(self, network: Any) -> nn.Module:
+        return RewrittenRigConditionedNet(network)

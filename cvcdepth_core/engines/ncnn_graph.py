@@ -15,7 +15,7 @@ from typing import Any
 from torch import Tensor, fx, nn, sigmoid
 from torch.nn import functional as F  # noqa: N812 - the field's name for it
 
-from cvcdepth_core.engines.rewriting import ConvolutionTracer, RewrittenDepthNet
+from cvcdepth_core.engines.rewriting import ConvolutionTracer
 from cvcdepth_core.errors import EngineError
 from cvcdepth_core.networks.efficientnet_lite import SameConv
 
@@ -32,10 +32,11 @@ Parameters = dict[int, Any]
 """NCNN's numbers for a layer's parameters, to int, float or a tuple of floats."""
 
 
-def ncnn_model(network: RewrittenDepthNet) -> tuple[str, bytes]:
+def ncnn_model(network: nn.Module) -> tuple[str, bytes]:
     """Return the content of the `param` and of the `bin` file; EngineError names an operation that is not known here.
 
-    The input blob is `images` [3, H, W], the output blob `disparity` [1, H, W].
+    The input blobs are called as the arguments of the network's `forward` are, `images` [3, H, W] the first; the output
+    blob is `disparity`: [1, H, W], or whatever the network gives.
     """
     graph = fx.GraphModule(network, ConvolutionTracer().trace(network))
     writer = _Writer()
@@ -64,7 +65,7 @@ class _Writer:
         """Write one layer. A blob can be read once: one with several readers is split."""
         readers = sum(user.op != "output" for user in result.users)
         blob = result.name if readers else OUTPUT
-        blob = blob if sources else INPUT
+        blob = blob if sources else str(result.target)
         self._lines.append((layer.type, [self._blobs[source].pop() for source in sources], [blob], layer.parameters))
         self._blobs[result] = [blob]
         if readers > 1:

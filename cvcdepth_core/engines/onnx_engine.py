@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from cvcdepth_core.engines.conditioning import KeptConditioning
+from cvcdepth_core.engines.conditioning import KeptForRig, conditioning_of
 from cvcdepth_core.engines.engine import DeviceMemoryError, best_chunk, image_by_image
 from cvcdepth_core.engines.example_rigs import ring_of_cameras
 from cvcdepth_core.engines.rewriting import RewrittenDepthNet
@@ -112,7 +112,7 @@ class OnnxRuntimeEngine:
         self.model = onnx_model(network, spec)
         self._session = _session(self.model, [(provider, options)])
         self._takes_images = isinstance(network, DepthNet)
-        self._told = KeptConditioning(network) if isinstance(network, ConditionedNetwork) else None
+        self._told = KeptForRig(conditioning_of(network)) if isinstance(network, ConditionedNetwork) else None
         self._inputs = [given.name for given in self._session.get_inputs()]
 
     def disparity(self, rig: RigImages) -> Tensor:
@@ -120,7 +120,7 @@ class OnnxRuntimeEngine:
         if self._takes_images:
             return image_by_image(lambda images: _run(self._session, {INPUT: images}), rig)
         if self._told is not None:
-            told = self._told(rig)
+            (told,) = self._told(rig)
             return image_by_image(lambda images: _run(self._session, {INPUT: images, CONDITIONING: told}), rig)
         return _run(self._session, {name: getattr(rig, name) for name in self._inputs})
 

@@ -20,6 +20,7 @@ from cvcdepth_core.errors import ConfigError, EngineError
 from cvcdepth_core.model_choices import BACKENDS, Precision
 from cvcdepth_core.networks import DepthNet, DepthNetwork
 from cvcdepth_core.networks.registry import DepthModelSpec
+from cvcdepth_core.networks.rig_conditioned import RigConditionedNet
 from cvcdepth_core.processor import instructions
 
 # What has to be importable, and how to get it.
@@ -240,6 +241,10 @@ def _build(
         from cvcdepth_core.engines.onnx_engine import OnnxRuntimeEngine
 
         return OnnxRuntimeEngine(network, spec, device)
+    if backend == "ncnn" and isinstance(network, RigConditionedNet):
+        from cvcdepth_core.engines.ncnn_engine import ConditionedNcnnEngine
+
+        return ConditionedNcnnEngine(network)
     published = _published(network, spec, backend)
     if backend == "ncnn":
         from cvcdepth_core.engines.ncnn_engine import NcnnEngine

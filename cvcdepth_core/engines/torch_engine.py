@@ -9,7 +9,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from cvcdepth_core.engines.conditioning import KeptConditioning
+from cvcdepth_core.engines.conditioning import KeptForRig, conditioning_of
 from cvcdepth_core.engines.engine import best_chunk, image_by_image
 from cvcdepth_core.engines.rewriting import RewrittenDepthNet
 from cvcdepth_core.model_choices import Precision
@@ -24,13 +24,15 @@ class TorchEagerEngine:
         self.device = device
         self.chunk = best_chunk(network, device)
         self._network = copy.deepcopy(network).eval().to(device)
-        self._told = KeptConditioning(self._network) if isinstance(self._network, ConditionedNetwork) else None
+        self._told = (
+            KeptForRig(conditioning_of(self._network)) if isinstance(self._network, ConditionedNetwork) else None
+        )
 
     @torch.inference_mode()
     def disparity(self, rig: RigImages) -> Tensor:
         """See `DisparityEngine`."""
         if isinstance(self._network, ConditionedNetwork) and self._told is not None:
-            found = self._network.disparity(rig.images.flatten(0, 1), self._told(rig))
+            found = self._network.disparity(rig.images.flatten(0, 1), *self._told(rig))
             return found.view(*rig.images.shape[:2], *found.shape[1:])
         disparity: Tensor = self._network(rig)
         return disparity

@@ -85,9 +85,10 @@ def _units(packet: bytes) -> Iterator[tuple[int, bytes]]:
     start = packet.find(_START_CODE)
     while 0 <= start < len(packet) - len(_START_CODE):
         begin = start + len(_START_CODE)
+        unit = packet[begin : begin + _HEAD].partition(_START_CODE)[0]
+        if unit:
+            yield unit[0] & 0x1F, unit.replace(b"\x00\x00\x03", b"\x00\x00")
         start = packet.find(_START_CODE, begin)
-        unit = packet[begin : min(begin + _HEAD, start if start >= 0 else len(packet))]
-        yield unit[0] & 0x1F, unit.replace(b"\x00\x00\x03", b"\x00\x00")
 
 
 class _Bits:

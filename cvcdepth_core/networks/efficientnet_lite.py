@@ -111,7 +111,10 @@ class EfficientNetLite0Body(nn.Module):
 
     def after_stem(self, x: Tensor) -> list[Tensor]:
         """Map what the first convolution gives, [B, C, H/2, W/2], to the same features."""
-        x = F.relu6(self.stem_norm(x), inplace=True)
+        return self.features(F.relu6(self.stem_norm(x), inplace=True))
+
+    def features(self, x: Tensor) -> list[Tensor]:
+        """Map the stem's result, [B, C, H/2, W/2], to the same features."""
         features = []
         for index, stage in enumerate(self.stages):
             x = stage(x)

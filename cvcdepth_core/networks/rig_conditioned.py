@@ -41,7 +41,7 @@ class RigConditionedNet(ConditionedNetwork):
     """
 
     independent: ClassVar[bool] = True
-    engines: ClassVar[tuple[str, ...]] = ("onnxruntime", "torch_eager")
+    engines: ClassVar[tuple[str, ...]] = ("ncnn", "onnxruntime", "torch_eager")
     ENCODER: ClassVar[str] = "efficientnet_lite0"
 
     def __init__(self, min_depth: float, max_depth: float, focal_scale: float) -> None:
@@ -84,8 +84,12 @@ class RigConditionedNet(ConditionedNetwork):
     def _outputs(self, images: Tensor, conditioning: Tensor) -> DepthOutputs:
         refuse_input_size(*images.shape[-2:])
         told, ground = conditioning.split([CHANNELS, 1], dim=1)  # type: ignore[no-untyped-call]
-        head = self.depth_decoder(self._features(images, told), told)
-        free, gate, sky, log_uncertainty = head.to(ground.dtype).split(1, dim=1)
+        return self.from_head(self.depth_decoder(self._features(images, told), told), ground)
+
+    def from_head(self, head: Tensor, ground: Tensor) -> DepthOutputs:
+        """Return the outputs [B, 1, H, W] of the decoder's result and the last channel of the conditioning."""
+        head = F.pixel_shuffle(head, 2)
+        free, gate, sky, log_uncertainty = head.to(ground.dtype).split(1, dim=1)  # type: ignore[no-untyped-call]
         on_ground = torch.sigmoid(gate) * (ground > 0).to(ground.dtype)
         log_ground = -torch.log(ground.clamp(min=1e-6))
         log_depth = torch.lerp(free * _LOG_STEP + _FIRST_DEPTH, log_ground, on_ground)
@@ -119,13 +123,13 @@ class ConditionedDecoder(nn.Module):
         _start_alike(self.head.conv)
 
     def forward(self, features: Sequence[Tensor], told: Tensor) -> Tensor:
-        """Turn feature maps, finest (H/2) first, and conditioning [B, C, H, W] into [B, `_OUTPUTS`, H, W]."""
+        """Turn feature maps, finest (H/2) first, and conditioning [B, C, H, W] into [B, 4 `_OUTPUTS`, H/2, W/2]."""
         pyramid = [F.avg_pool2d(told, 2 ** (level + 1)) for level in range(5)]
         x = self.top(torch.cat([features[4], pyramid[4]], dim=1))
         for step, level in zip(self.steps, reversed(range(4)), strict=True):
             x = F.interpolate(x, scale_factor=2.0, mode="nearest")
             x = step(torch.cat([x, features[level], pyramid[level]], dim=1))
-        outputs: Tensor = F.pixel_shuffle(self.head(x), 2)
+        outputs: Tensor = self.head(x)
         return outputs
 
 

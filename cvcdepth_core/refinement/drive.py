@@ -92,6 +92,11 @@ class DriveRefiner:
         self._last = self._watched = self._velocity = self._seen = None
         self._checked_ns = self._odometry_ns = None
 
+    @property
+    def has_judged_odometry(self) -> bool:
+        """Whether enough sets were compared with odometry to know whether it fits."""
+        return self._check.is_ready
+
     def refine(self, moment: SurroundMoment) -> RefinedSet:
         """Refine the next set; its `world_T_base` is the recorded motion, None where that is not known now."""
         if self._last is not None and moment.time_ns < self._last.time_ns - _SPREAD_NS:

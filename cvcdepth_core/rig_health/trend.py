@@ -10,9 +10,16 @@ from numpy.typing import NDArray
 
 from cvcdepth_core.stamps import NANOSECONDS
 
+_LEAST = 4
+"""Measurements that are averaged, where there are so many."""
+
 
 class Trend:
-    """Mean of the last seconds, and baseline: a slow mean that is not updated while the quantity is abnormal."""
+    """Mean of the last seconds, and baseline: a slow mean that is not updated while the quantity is abnormal.
+
+    A single set's streets can favour another value than the average of many: where measurements are rare, because sets
+    are, the mean goes back further than its seconds.
+    """
 
     def __init__(self, window: float, baseline: float, learning: float) -> None:
         """Average over `window` seconds, and for the baseline over `baseline`; it is known after `learning` of them."""
@@ -31,8 +38,8 @@ class Trend:
 
     @property
     def is_learnt(self) -> bool:
-        """Whether it was measured for long enough to know the baseline."""
-        return self._learnt >= self._learning
+        """Whether it was measured for long enough, and often enough, to know the baseline."""
+        return self._learnt >= self._learning and self.measurements >= 2 * _LEAST
 
     def add(self, stamp: int, value: NDArray[np.float64], is_normal: bool) -> None:
         """Take in one measurement; `is_normal` says whether the baseline may learn from it."""
@@ -40,7 +47,7 @@ class Trend:
         self._updates_without = 0
         seconds = (stamp - self._recent[-1][0]) / NANOSECONDS if self._recent else 0.0
         self._recent.append((stamp, value))
-        while stamp - self._recent[0][0] > self._window * NANOSECONDS:
+        while len(self._recent) > _LEAST and stamp - self._recent[0][0] > self._window * NANOSECONDS:
             self._recent.popleft()
         self.now = np.mean([recent for _, recent in self._recent], axis=0)
         if is_normal or not self.is_learnt:

@@ -158,6 +158,8 @@ class EvaluationConfig(_Section):
     """Held-out sets, at most, that a validation during the run scores; at its start and end all are scored."""
     patience: int | None = Field(default=None, ge=1)
     """Validations in a row without a better score after which the run ends; null: it never ends early."""
+    refine: Literal["off", "geometry"] = "off"
+    """Whether depth is refined before it is scored, as the node's parameter refine has it."""
 
 
 class TrainingConfig(_Section):

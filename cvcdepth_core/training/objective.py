@@ -405,7 +405,7 @@ def _masked_errors(
     auto_masks = auto_mask(reprojection, _identity_error(batch, statistics, identity_noise)) * batch.masks
     errors = {"temporal": [MaskedError(reprojection, auto_masks)]}
     for part in overlap.parts:
-        for name, error in _overlap_errors(batch, part, auto_masks, config).items():
+        for name, error in _overlap_errors(batch, part, auto_masks, statistics, config).items():
             errors.setdefault(name, []).append(error)
     depth = overlap.depth
     if depth is not None:
@@ -415,12 +415,16 @@ def _masked_errors(
 
 
 def _overlap_errors(
-    batch: RigBatch, part: OverlapPart, auto_masks: Tensor, config: ObjectiveConfig
+    batch: RigBatch, part: OverlapPart, auto_masks: Tensor, of_targets: TargetStatistics, config: ObjectiveConfig
 ) -> dict[str, MaskedError]:
-    """Return those of the photometric terms of the overlap."""
+    """Return those of the photometric terms of the overlap.
+
+    `of_targets` are those of the whole images. What they see beyond a strip counts for its outermost columns alone,
+    where masks are zero.
+    """
     strips = part.strips
     target, own_masks = strips.cut(batch.images)[:, None], strips.cut(batch.masks)
-    statistics = TargetStatistics.from_images(target)
+    statistics = TargetStatistics(*(strips.cut(whole) for whole in of_targets))
     frames = [1, part.images.shape[1] - 1]
     spatial, spatio_temporal = part.images.split(frames, dim=1)  # type: ignore[no-untyped-call]
     spatial_mask = own_masks * part.masks[:, 0]

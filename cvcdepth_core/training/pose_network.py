@@ -122,6 +122,13 @@ class PoseScore(NamedTuple):
         return cls.joined([cls(1, *error) for error in errors])
 
 
+def pose_score_to_json(score: PoseScore | None) -> dict[str, float | None]:
+    """Return a score for JSON: no steps and null where nothing could be compared."""
+    if score is None:
+        return {"steps": 0, **dict.fromkeys([*PoseScore._fields[1:], "ratio"])}
+    return {**score._asdict(), "ratio": score.ratio}
+
+
 def _described(checkpoint: Checkpoint) -> tuple[str, PoseMethod]:
     """Return encoder and method."""
     try:

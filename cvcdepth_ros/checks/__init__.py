@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection, Mapping
 from typing import NamedTuple
 
 from cvcdepth_ros.checks.context import CheckContext, CheckOptions, CheckResult, Status
+from cvcdepth_ros.checks.depth_checks import check_mounts, check_odometry
 from cvcdepth_ros.checks.picture_checks import check_brightness, check_places
 from cvcdepth_ros.checks.rig_checks import (
     check_camera_infos,
@@ -37,6 +38,8 @@ CHECKS: Mapping[str, Callable[[CheckContext], CheckResult]] = {
     "training": check_training,
     "pose network": check_pose_network,
     "lenses": check_lenses,
+    "mounts": check_mounts,
+    "odometry": check_odometry,
 }
 
 

@@ -24,6 +24,7 @@ from cvcdepth_ros.messages.camera_discovery import RECORDED_IMAGE_TYPES
 from cvcdepth_ros.messages.conversion import picture_from_message
 from cvcdepth_ros.messages.recorded_changes import CalibrationHistory
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
+from cvcdepth_ros.recordings.compared_pictures import ComparedPictures
 from cvcdepth_ros.recordings.motion import VehicleMotion, find_motion_link
 from cvcdepth_ros.recordings.refusals import Refusals
 from cvcdepth_ros.recordings.rig import chosen_layout
@@ -70,6 +71,8 @@ class CheckOptions:
     """How training samples would be chosen."""
     checkpoint: Path | None = None
     """Weights whose pose network is compared with the recorded motion."""
+    pictures: bool = False
+    """Whether the network is run, to compare pictures with mounts and motion."""
     start: int | None = None
     """First log time to read, ns."""
     stop: int | None = None
@@ -125,6 +128,8 @@ class CheckContext:
         """Every image, in the order of recording."""
         self.sweeps: dict[str, list[Any]] = defaultdict(list)
         """The first sweeps of each LiDAR; RecordingError in place of one that is no message."""
+        self.compared: ComparedPictures | CheckResult | None = None
+        """What comparing pictures told, or why it could not be done; None before."""
         self._first_images: dict[str, RecordedMessage] = {}
         self._read(progress)
 

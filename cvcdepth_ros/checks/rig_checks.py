@@ -48,7 +48,7 @@ def check_cameras(context: CheckContext) -> CheckResult:
     told = "; ".join([*cameras.choices, *cameras.left_out][:_MAX_LISTED])
     found = f"{found}; {told}" if told else found
     if len(names) == 1:
-        remedy = "it is enough for run, node and evaluate; metric scale is learned from two cameras that overlap"
+        remedy = "it is enough for run, node and evaluate; scale is learned from two cameras that overlap, or odometry"
         return CheckResult("warning", found, remedy, values)
     return CheckResult("passed", found, values=values)
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from cvcdepth_core.errors import RecordingError, RigError, TransformError
 from cvcdepth_core.images.rectifier import Rectifier
 from cvcdepth_core.images.surround import self_occlusion_mask
+from cvcdepth_core.rig.lens_use import lens_uses
 from cvcdepth_core.rig.rig import Camera, Rig
 from cvcdepth_core.rig_health.own_body import lane_share
 from cvcdepth_core.stamps import NANOSECONDS
@@ -41,7 +42,7 @@ def check_overlaps(context: CheckContext) -> CheckResult:
     values = {"degrees": {f"{a} - {b}": round(angles.get((a, b), 0.0), 1) for a, b in sorted(pairs)}}
     lonely = [name for name, others in neighbours.items() if not others]
     if lonely:
-        remedy = "correct the calibration or transform; training needs overlaps, depth from a checkpoint does not"
+        remedy = _remedy_for_overlaps(context, lonely)
         if context.motion is not None:
             remedy += f"; or odometry: with recordings.motion: auto the scale comes from {context.motion.topic}"
         none_shared = len(lonely) == len(neighbours) > 1
@@ -50,6 +51,14 @@ def check_overlaps(context: CheckContext) -> CheckResult:
     narrowest = min(values["degrees"], key=values["degrees"].__getitem__)
     finding = f"{len(pairs)} pairs of cameras, the narrowest {narrowest} ({values['degrees'][narrowest]:.1f} degrees)"
     return CheckResult("passed", finding, values=values)
+
+
+def _remedy_for_overlaps(context: CheckContext, lonely: Collection[str]) -> str:
+    """Return what helps: a right calibration, or where lenses see more than is shown of them, to show it."""
+    uses = lens_uses(context.assembler.completed_layout()) if context.assembler else []
+    is_hidden = any(use.is_wasted and use.possible_overlap > use.overlap and {*use.cameras} & {*lonely} for use in uses)
+    whole, right = "show all of each lens (`cvcdepth rig BAG --view lens`)", "correct the calibration or transform"
+    return f"{whole if is_hidden else right}; training needs overlaps, depth from a checkpoint does not"
 
 
 def check_masks(context: CheckContext) -> CheckResult:

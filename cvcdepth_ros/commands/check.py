@@ -34,9 +34,10 @@ if TYPE_CHECKING:
 
 SUMMARY = """Check whether recordings and a rig will work, with a remedy for what will not.
 
-Fifteen numbered checks: cameras, calibrations, transforms, stamps, sets, overlaps, masks, LiDAR, motion, encodings,
-brightness, whether two cameras were swapped, what `finetune` would learn from, a checkpoint's pose network, and how
-much of its lens each camera shows. The exit code is 1 when a check failed; warnings leave it at 0."""
+Seventeen numbered checks: cameras, calibrations, transforms, stamps, sets, overlaps, masks, LiDAR, motion, encodings,
+brightness, whether two cameras were swapped, what `finetune` would learn from, a checkpoint's pose network, how much of
+its lens each camera shows, and with --pictures whether neighbours' pictures fit the mounts, and odometry the pictures.
+The exit code is 1 when a check failed; warnings leave it at 0."""
 EXAMPLES: tuple[str, ...] = (
     "check drive.mcap",
     "check drives/ --rig rig.yaml --tolerance 0.05 --lidar /lidar/points --json",
@@ -84,6 +85,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--checkpoint", metavar="FILE", help="compare this checkpoint's pose network with the recorded motion"
     )
+    parser.add_argument(
+        "--pictures", action="store_true", help="run the network to check mounts and odometry by the pictures"
+    )
     add_lidar(parser)
     add_skip(parser)
     add_window(parser)
@@ -124,6 +128,7 @@ def _checked(location: "Location", layout: "RigLayout | None", arguments: argpar
                 stop=window[1],
                 training=training,
                 checkpoint=checkpoint,
+                pictures=arguments.pictures,
             )
             with recording_progress(recording, window, arguments.quiet) as progress:
                 context = CheckContext(recording, options, layout, progress)

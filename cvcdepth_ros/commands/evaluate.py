@@ -183,6 +183,8 @@ def _jobs(arguments: argparse.Namespace, settings: EvaluationSettings) -> list[E
     names = unique_names([(location.name, str(location)) for location in locations])
     layout = rig_layout(arguments)
     lidar, window = lidar_topics(arguments), (arguments.start, arguments.duration)
+    if settings.truth == "depth" and lidar is not None:
+        arguments.usage_error("--truth depth: depth images are the truth, so --lidar and --no-lidar have no meaning")
     job = EvaluationJob("", "", settings, layout, arguments.base_frame, lidar, *window)
     return [replace(job, name=name, path=str(path)) for name, path in zip(names, locations, strict=True)]
 

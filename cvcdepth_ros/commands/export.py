@@ -35,6 +35,33 @@ _WHOLE_RIG = {
     "masks [1, N, 1, H, W] float32, 1 = scene",
     "output": "disparity [1, N, 1, H, W], float32 in (0, 1)",
 }
+_TOLD_ITS_RIG: dict[str, Any] = {
+    "input": "images [B, 3, H, W], float32 RGB in [0, 1], rectified; H and W multiples of 32; and conditioning "
+    "[B, 11, H, W] float32, made once for each camera",
+    "output": "disparity [B, 1, H, W], float32 in [0, 1], 0 in the sky",
+    "conditioning": {
+        "x, y": "(u - cx) / fx and (v - cy) / fy of each pixel, centres at the integers",
+        "forward, left, up": "the ray (x, y, 1), turned from the camera's optical frame into the vehicle's",
+        "height": "metres of the camera above the ground",
+        "level": "sqrt(forward**2 + left**2)",
+        "ground": "-up / maximum(height, 0.2)",
+        "near": "clip(ground, 0, 3)",
+        "below": "where(ground > 1 / 150, 1.0, 0.0)",
+        "channels": [
+            "minimum(3 * near, 2)",
+            "0.3 * log(maximum(near, 0.005)) + 0.6",
+            "2 * up / sqrt(level**2 + up**2)",
+            "forward / maximum(level, 0.05)",
+            "left / maximum(level, 0.05)",
+            "x",
+            "y",
+            "log(fx / focal_scale)",
+            "height - 1.6",
+            "below",
+            "near * below * fx / focal_scale",
+        ],
+    },
+}
 _DEPTH = "depth = fx / (focal_scale * (1 / max_depth + (1 / min_depth - 1 / max_depth) * disparity))"
 
 
@@ -89,14 +116,15 @@ def _build_tensorrt(checkpoint: "Checkpoint", precision: Precision, device: str)
 
 def _description(checkpoint: "Checkpoint") -> dict[str, Any]:
     """Return what a program has to know to use the model."""
-    from cvcdepth_core.networks.registry import PER_CAMERA
+    from cvcdepth_core.networks.registry import PER_CAMERA, RIG_CONDITIONED
 
+    known = {PER_CAMERA: _ONE_IMAGE, RIG_CONDITIONED: _TOLD_ITS_RIG}
     return {
         "version": package_version(),
         "checkpoint": checkpoint.path.name,
         "sha256": checkpoint.sha256,
         **checkpoint.spec.model_dump(),
-        **(_ONE_IMAGE if checkpoint.spec.network == PER_CAMERA else _WHOLE_RIG),
+        **known.get(checkpoint.spec.network, _WHOLE_RIG),
         "depth": _DEPTH,
         "fx": "each camera's focal length in pixels of H x W; depth is metres along the optical axis",
     }

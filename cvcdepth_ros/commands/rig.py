@@ -29,7 +29,7 @@ Finds the cameras, takes their calibrations from camera_info and their poses fro
 counter-clockwise around the vehicle from the front one, and computes which of them see the same space. With --masks it
 finds where a camera sees the vehicle itself, which stands still in the picture while the scene moves, and writes a PNG
 for it beside the rig file. With --rig, a file that names the cameras only (config/rigs/) is completed. With --refine,
-the pictures themselves tell how the cameras are turned: small rotations that make neighbours agree where they overlap.
+cameras are turned a little so that neighbours' pictures agree where they overlap; it refuses where they do not tell.
 
 With --view the cameras show so much of their lenses, whatever P of camera_info says. A lens of more than 120 degrees is
 shown by two or three virtual cameras, NAME_l, NAME_m and NAME_r."""
@@ -290,22 +290,22 @@ def _view_text(camera: dict[str, Any]) -> str:
 def _refined_text(refined: dict[str, Any]) -> str:
     """Show how well neighbours' pictures agree, and how each camera was turned."""
     pairs = [
-        (
-            f"{p['camera']} - {p['neighbour']}",
-            str(p["patches"]),
-            _number(p["before"]),
-            _number(p["after"]),
-            p["problem"],
-        )
-        for p in refined["pairs"]
+        (_pair_name(pair), str(pair["patches"]), _number(pair["before"]), _number(pair["after"]))
+        for pair in refined["pairs"]
     ]
-    header = ("pair", "patches", "correlation", "turned", "")
-    shown = table(header, [(*pair[:-1], pair[-1] or "") for pair in pairs], numbers=range(1, 4), apart=4)
+    shown = table(("neighbours' pictures", "patches", "correlation", "turned"), pairs, numbers=range(1, 4))
+    left_out = [f"left out: {_pair_name(pair)}: {pair['problem']}" for pair in refined["pairs"] if pair["problem"]]
     turns = [
         f"  {name}: {'left as it is' if turn is None else ' '.join(f'{angle:+.2f}' for angle in turn)}"
         for name, turn in refined["turns"].items()
     ]
-    return "\n".join([shown, "", "Turned about its own x (right), y (down) and z (ahead), in degrees:", *turns])
+    return "\n".join(
+        [shown, *left_out, "", "Turned about its own x (right), y (down) and z (ahead), in degrees:", *turns]
+    )
+
+
+def _pair_name(pair: dict[str, Any]) -> str:
+    return f"{pair['camera']} - {pair['neighbour']}"
 
 
 def _number(value: float | None) -> str:

@@ -13,7 +13,7 @@ from cvcdepth_core.errors import CheckpointError
 from cvcdepth_core.networks.checkpoint import load_checkpoint
 from cvcdepth_core.rig.poses import inverse
 from cvcdepth_core.stamps import NANOSECONDS
-from cvcdepth_core.training.pose_network import MotionError, PoseAnswers, PoseScore, motion_error
+from cvcdepth_core.training.pose_network import MotionError, PoseAnswers, PoseScore, motion_error, pose_score_to_json
 
 if TYPE_CHECKING:
     from cvcdepth_ros.evaluation.measuring import MeasuredSet
@@ -49,10 +49,9 @@ class PoseScoring:
             self._errors.append(error)
         self._earlier = measured
 
-    def result(self) -> dict[str, Any] | None:
-        """Return the score for JSON; None where nothing could be compared."""
-        score = PoseScore.of(self._errors)
-        return None if score is None else {**score._asdict(), "ratio": score.ratio}
+    def result(self) -> dict[str, float | None]:
+        """Return the score for JSON."""
+        return pose_score_to_json(PoseScore.of(self._errors))
 
     def _error(self, network: PoseAnswers, earlier: MeasuredSet, later: MeasuredSet) -> MotionError | None:
         rig = later.estimated.rig
@@ -68,5 +67,5 @@ class PoseScoring:
 
 def joined_pose_score(summaries: Iterable[Mapping[str, Any]]) -> PoseScore | None:
     """Return the score of several recordings, from what their summaries say."""
-    found = [summary["pose_network"] for summary in summaries if summary.get("pose_network")]
+    found = [summary["pose_network"] for summary in summaries if summary["pose_network"]["steps"]]
     return PoseScore.joined([PoseScore(**{name: one[name] for name in PoseScore._fields}) for one in found])

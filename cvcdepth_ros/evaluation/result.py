@@ -18,7 +18,7 @@ from cvcdepth_core.scoring.comparison import Comparison, compare
 from cvcdepth_core.scoring.confidence_scores import ConfidenceScores
 from cvcdepth_core.scoring.consistency import AgreementTable, summarise_agreement
 from cvcdepth_core.scoring.scores import ALL, SCALINGS, EvaluationProtocol, Scaling, Score, Scores, Summary
-from cvcdepth_core.training.pose_network import PoseScore
+from cvcdepth_core.training.pose_network import PoseScore, pose_score_to_json
 from cvcdepth_ros.evaluation.image_scores import (
     ImageScore,
     LabelFree,
@@ -186,18 +186,13 @@ class EvaluationResult:
             "scale_ratio": {p: nan_to_null(self.scores.scale_ratios(p)) for p in PROTOCOLS},
             "label_free": self._label_free(),
             "confidence": self.confidence.to_json() if self.confidence else None,
-            "pose_network": self.pose_network(),
+            "pose_network": pose_score_to_json(self.pose_score),
             "references": {name: reference.to_json() for name, reference in self.references.items()},
             "recordings": [recording.summary for recording in self.recordings],
             "trained_on": [seen._asdict() for seen in self.trained_on],
             "failed": [failure._asdict() for failure in self.failed],
             "rows": self.scores.to_json(),
         }
-
-    def pose_network(self) -> dict[str, Any] | None:
-        """Return `pose_score` for JSON."""
-        score = self.pose_score
-        return None if score is None else {**score._asdict(), "ratio": score.ratio}
 
     def _label_free(self) -> dict[str, Any]:
         pairs = [

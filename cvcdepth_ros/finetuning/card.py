@@ -18,6 +18,7 @@ from cvcdepth_core.errors import CvcDepthError
 from cvcdepth_core.files import nan_to_null, write_atomically, write_json
 from cvcdepth_core.networks.checkpoint import load_checkpoint
 from cvcdepth_core.stamps import NANOSECONDS
+from cvcdepth_core.training.pose_network import pose_score_to_json
 from cvcdepth_ros.bags import file_identities
 from cvcdepth_ros.evaluation.result import EvaluationResult
 from cvcdepth_ros.finetuning.judgement import camera_numbers, numbers_of
@@ -93,7 +94,7 @@ def pose_lines(scores: Mapping[str, Any]) -> Iterator[str]:
     told = [
         f"{one['ratio']:.2f} of the recorded way, {one['degrees']:.2f} degrees off, {when}"
         for when, one in found.items()
-        if one
+        if one and one["steps"]
     ]
     if told:
         yield f"The pose network tells {'; '.join(told)}."
@@ -104,7 +105,7 @@ def _scores(result: EvaluationResult | None) -> dict[str, Any] | None:
     if result is None:
         return None
     held_out, cameras = nan_to_null(numbers_of(result)), camera_numbers(result)
-    return {"held_out": held_out, "cameras": cameras, "pose_network": result.pose_network()}
+    return {"held_out": held_out, "cameras": cameras, "pose_network": pose_score_to_json(result.pose_score)}
 
 
 def _recording(result: FinetuneResult, number: int) -> dict[str, Any]:

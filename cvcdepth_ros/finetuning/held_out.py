@@ -49,6 +49,7 @@ def held_out_parts(
         {
             "tolerance": config.recordings.tolerance,
             "max_depth": config.evaluation.max_depth,
+            "refine": config.evaluation.refine,
             "device": device,
             "backend": "torch_eager",  # the network as it was trained; other engines are checked against it elsewhere
             "threads": torch.get_num_threads(),

@@ -17,6 +17,7 @@ from cvcdepth_core.images.video import VIDEO_EXTRA, VideoDecoder, codec_of, is_k
 from cvcdepth_ros.messages.conversion import header_of, video_codec
 
 _MOST_WAITING = 30
+_FEW_WAITING = 3  # what came too fast begins again without a queue, or every later picture would be as late
 
 
 def video_problem() -> str:
@@ -105,7 +106,7 @@ class _Stream:
         self._waiting = [decoded for decoded in self._waiting if not decoded.done()]
         if len(self._waiting) >= _MOST_WAITING:
             self._failed, self._reason = self._count, "its video comes faster than it can be decoded"
-        elif is_key_frame(codec, packet):
+        elif is_key_frame(codec, packet) and (self._last_key > self._failed or len(self._waiting) <= _FEW_WAITING):
             self._last_key = self._count
         if self._last_key <= self._failed:
             raise ImageError(f"camera {self._camera}: waiting for a key frame: {self._reason}")

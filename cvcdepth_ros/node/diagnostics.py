@@ -116,14 +116,15 @@ def refinement_status(stage: RefinementStage, motion: VehiclePoses) -> Diagnosti
     last = stage.last
     if last is None:
         return status(OK, "refinement", "no set yet", {"motion topic": motion.topic or "none"})
-    values: dict[str, Any] = {"motion": last.source, "motion topic": motion.topic or "none"}
-    found = last.depth
-    for name, share, earlier, beside in zip(stage.cameras, found.checked, found.earlier, found.beside, strict=True):
+    cameras, refined = last
+    values: dict[str, Any] = {"motion": refined.source, "motion topic": motion.topic or "none"}
+    found = refined.depth
+    for name, share, earlier, beside in zip(cameras, found.checked, found.earlier, found.beside, strict=True):
         values[f"{name}: checked share"] = float(share)
         values[f"{name}: earlier pictures"] = int(earlier)
         values[f"{name}: neighbours"] = int(beside)
-    problem = last.odometry_problem or motion.problem
-    return status(WARN if problem else OK, "refinement", problem or _EVIDENCE[last.source], values)
+    problem = refined.odometry_problem or motion.problem
+    return status(WARN if problem else OK, "refinement", problem or _EVIDENCE[refined.source], values)
 
 
 def _text(value: Any) -> str:

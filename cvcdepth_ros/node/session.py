@@ -186,6 +186,11 @@ class SurroundSession:
         """Return what the comparison of neighbouring cameras has found; empty where all is well."""
         return "; ".join(map(str, self._overlaps.findings())) if self._overlaps else ""
 
+    def odometry_problem(self) -> str:
+        """Return why recorded motion is not used, or what is odd about it; empty where it fits."""
+        last = self._refinement.last
+        return (last.refined.odometry_problem if last else "") or self._motion.poses.problem
+
     @property
     def unknown_latencies(self) -> list[str]:
         """The stages whose latencies cannot be known, since images are not stamped in the node's time."""

@@ -176,6 +176,7 @@ class SurroundDepthNode(ManagedNode):
             "sets": session.standstill(clock) if session else "",
             "transport": session.transport_problem if session else "",
             "cross-view consistency": session.overlap_findings() if session else "",
+            "refinement": session.odometry_problem() if session else "",
         }
 
     def _node_clock(self) -> NodeClock:

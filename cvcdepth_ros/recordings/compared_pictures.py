@@ -57,6 +57,8 @@ class ComparedPictures:
     odometry_problem: str
     """What is wrong with recorded motion; empty where it fits, or there is none."""
     has_odometry: bool
+    has_judged_odometry: bool
+    """Whether there were enough sets in a row to know whether it fits."""
 
 
 def parts_of(start: int, stop: int, count: int, seconds: float) -> list[Part]:
@@ -74,18 +76,23 @@ def compare_pictures(
     matching: MatchingSettings,
     progress: Progress = lambda _: None,
 ) -> ComparedPictures:
-    """Look at the sets of these parts; RigError when there is none."""
+    """Look at the sets of these parts; RigError when there are too few."""
     rig = recorded.layout.complete()
     search = MountSearch(rig.neighbour_indices, rig.names.index(rig.anchor))
     problems: list[str] = []
-    sets = 0
+    sets, is_judged = 0, False
     for number, part in enumerate(parts):
         found = _Compared(recorded, predictor, matching, search)
         sets += found.look_at(part)
         problems += [found.problem] if found.problem else []
+        is_judged |= found.has_judged_odometry
         progress((number + 1) / len(parts))
-    has_odometry = recorded.vehicle_motion() is not None
-    return ComparedPictures(rig, sets, search.result(), problems[0] if problems else "", has_odometry)
+    if sets <= _WARM_UP:
+        raise RigError(
+            f"{recorded.recording.path}: {sets} sets, more than {_WARM_UP} in a row are needed to compare pictures"
+        )
+    problem = problems[0] if problems else ""
+    return ComparedPictures(rig, sets, search.result(), problem, recorded.vehicle_motion() is not None, is_judged)
 
 
 def turned_layout(layout: RigLayout, mounts: RefinedMounts) -> RigLayout:
@@ -154,6 +161,10 @@ class _Compared:
         self._refiner = DriveRefiner(self._depths.surround.rig.neighbour_indices, grid)
         self._search = search
         self.problem = ""
+
+    @property
+    def has_judged_odometry(self) -> bool:
+        return self._refiner.has_judged_odometry
 
     def look_at(self, part: Part) -> int:
         """Search every second set; return how many there are."""

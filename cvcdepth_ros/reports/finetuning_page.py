@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 
@@ -55,30 +55,39 @@ def _shown_sets(result: FinetuneResult) -> list[ShownSet]:
         return []
     earlier = {(found.recording, found.stamp_ns): found for found in before.sets}
     jobs = {part.job.name: part.job for part in result.parts}
-    networks = (("before", result.job.run / START_FILE, before), ("after", result.weights, after))
-    return [
-        _shown(title, [earlier[score.recording, score.stamp_ns], score], jobs[score.recording], networks)
-        for title, score in chosen_sets(after.sets)
-        if (score.recording, score.stamp_ns) in earlier
-    ]
-
-
-def _shown(
-    title: str, scores: Sequence[SetScore], job: EvaluationJob, networks: Sequence[tuple[str, Path, EvaluationResult]]
-) -> ShownSet:
-    def draw() -> list[SetPictures]:
+    with Remeasuring() as start, Remeasuring() as end:
+        networks = (
+            _Network("before", result.job.run / START_FILE, before, start),
+            _Network("after", result.weights, after, end),
+        )
         return [
-            _drawn(f"{title}, {when}", job, weights, result, score)
-            for (when, weights, result), score in zip(networks, scores, strict=True)
+            _shown(title, [earlier[score.recording, score.stamp_ns], score], jobs[score.recording], networks)
+            for title, score in chosen_sets(after.sets)
+            if (score.recording, score.stamp_ns) in earlier
         ]
 
+
+class _Network(NamedTuple):
+    """The network before or after."""
+
+    when: str
+    weights: Path
+    result: EvaluationResult
+    again: Remeasuring
+    """What measures with it, kept open from set to set."""
+
+    def drawn(self, title: str, job: EvaluationJob, score: SetScore) -> SetPictures:
+        """Draw a set as it sees it."""
+        settings = job.settings.model_copy(update={"checkpoint": str(self.weights)})
+        with_it = replace(job, settings=settings)
+        return drawn_again(f"{title}, {self.when}", score, self.result, with_it, self.again)
+
+
+def _shown(title: str, scores: Sequence[SetScore], job: EvaluationJob, networks: Sequence[_Network]) -> ShownSet:
+    def draw() -> list[SetPictures]:
+        return [network.drawn(title, job, score) for network, score in zip(networks, scores, strict=True)]
+
     return shown_set(title, scores, draw)
-
-
-def _drawn(title: str, job: EvaluationJob, weights: Path, result: EvaluationResult, score: SetScore) -> SetPictures:
-    settings = job.settings.model_copy(update={"checkpoint": str(weights)})
-    with Remeasuring() as again:
-        return drawn_again(title, score, result, replace(job, settings=settings), again)
 
 
 def _masks(result: FinetuneResult) -> dict[str, bytes]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any, TypeVar, get_args
+from typing import Any, NamedTuple, TypeVar, get_args
 
 import numpy as np
 
@@ -34,6 +34,13 @@ def _nowhere(times_ns: Mapping[str, int]) -> None:
     """Know of no motion."""
 
 
+class LastSet(NamedTuple):
+    """The cameras of a set, and what became of it."""
+
+    cameras: list[str]
+    refined: RefinedSet
+
+
 class RefinementStage:
     """Refines sets, or only says how sure their depth is, or leaves them as they are."""
 
@@ -56,13 +63,8 @@ class RefinementStage:
         self._refiner: DriveRefiner | None = None
         self._counts: Counter[MotionSource] = Counter()
         self._odometry_problem = ""
-        self.last: RefinedSet | None = None
+        self.last: LastSet | None = None
         """What became of the last set; None where nothing was done."""
-
-    @property
-    def cameras(self) -> list[str]:
-        """The names of the cameras that `last` is about."""
-        return self._surround.rig.names if self._surround else []
 
     @property
     def is_active(self) -> bool:
@@ -87,7 +89,7 @@ class RefinementStage:
         poses = self._poses_at(surround_set.times_ns)
         with self._latencies.measure("refinement"):
             found = refiner.refine(moment_of(surround, surround_set, result, poses))
-        self.last = found
+        self.last = LastSet(surround.rig.names, found)
         self._counts[found.source] += 1
         self._odometry_problem = self._odometry_problem or found.odometry_problem
         depth, confidence = found.depth.depth, found.depth.confidence

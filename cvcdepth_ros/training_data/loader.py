@@ -22,9 +22,8 @@ from cvcdepth_core.training.distributed import SINGLE_PROCESS, Processes
 from cvcdepth_ros.training_data.index import RecordingIndex
 from cvcdepth_ros.training_data.sample_choice import (
     Sample,
-    find_samples,
+    find_variants,
     refuse_standstill,
-    sample_variants,
     takes_recorded_motion,
 )
 from cvcdepth_ros.training_data.samples import NetworkRig, ReadSample, SampleReader
@@ -65,9 +64,9 @@ class RecordingBatches:
             _refuse_unlikely_ground(indexes)
         refuse_standstill(indexes, config.recordings)
         variants = [
-            sample_variants(index, config.recordings, sample)
+            of_target
             for recording, index in enumerate(indexes)
-            for sample in find_samples(index, config.recordings, "training", recording)
+            for of_target in find_variants(index, config.recordings, recording)
         ]
         every = [sample for of_target in variants for sample in of_target]
         self.reader = SampleReader(indexes, every, config.depth.height, config.depth.width, config.recordings)

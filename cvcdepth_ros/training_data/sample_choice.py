@@ -59,34 +59,29 @@ def first_held_out(index: RecordingIndex, held_out: float) -> int:
     return len(index) - math.ceil(held_out * (len(index) - 1))
 
 
-def find_samples(
-    index: RecordingIndex,
-    config: RecordingsConfig,
-    part: Part,
-    recording: int = 0,
-    targets: Sequence[int] | None = None,
-) -> list[Sample]:
-    """Return the samples of one part of a recording, or of some targets of it; none of their sets is of the other part.
+def find_samples(index: RecordingIndex, config: RecordingsConfig, part: Part, recording: int = 0) -> list[Sample]:
+    """Return the samples of one part of a recording, none of whose sets is of the other part.
 
     A sample's contexts are the nearest sets before and after the target that the vehicle has moved far enough from.
     Where they are known to be farther than wanted, or than the pose network can express, there is no sample, see
     `describe_skipped_samples`.
     """
-    found = _within_interval(index, config, part, recording, targets)
+    found = _within_interval(index, config, part, recording)
     return [sample for sample in found if _travel(index, sample) <= _greatest_travel(index, config)]
 
 
-def sample_variants(index: RecordingIndex, config: RecordingsConfig, sample: Sample) -> list[Sample]:
-    """Return a training sample and, for recorded motion, the same target with contexts that are farther away.
+def find_variants(index: RecordingIndex, config: RecordingsConfig, recording: int = 0) -> list[list[Sample]]:
+    """Return each training sample and, for recorded motion, the same target with contexts that are farther away.
 
     Where sets are far apart or the end is near, there are fewer than `further_travels` has.
     """
-    variants = [sample]
-    if takes_recorded_motion(index, config):
-        for least in config.further_travels:
-            further = config.model_copy(update={"min_travel": max(least, config.min_travel)})
-            variants += find_samples(index, further, "training", sample.recording, [sample.target])
-    return list(dict.fromkeys(variants))
+    leasts = config.further_travels if takes_recorded_motion(index, config) else ()
+    further = [config.model_copy(update={"min_travel": max(least, config.min_travel)}) for least in leasts]
+    by_target = [{one.target: one for one in find_samples(index, each, "training", recording)} for each in further]
+    return [
+        list(dict.fromkeys([sample, *(found[sample.target] for found in by_target if sample.target in found)]))
+        for sample in find_samples(index, config, "training", recording)
+    ]
 
 
 def describe_skipped_samples(index: RecordingIndex, config: RecordingsConfig) -> str | None:
@@ -115,19 +110,13 @@ def _travel(index: RecordingIndex, sample: Sample) -> float:
     return max(change_between(index, sample.target, other) for other in (sample.before, sample.after))
 
 
-def _within_interval(
-    index: RecordingIndex,
-    config: RecordingsConfig,
-    part: Part,
-    recording: int = 0,
-    targets: Sequence[int] | None = None,
-) -> list[Sample]:
+def _within_interval(index: RecordingIndex, config: RecordingsConfig, part: Part, recording: int = 0) -> list[Sample]:
     held_out = np.arange(len(index)) >= first_held_out(index, config.held_out)
-    members = np.flatnonzero(held_out == (part == "held_out")).tolist()
+    longest = longest_interval(index, config)
     samples = []
-    for target in members if targets is None else targets:
-        before = _context(index, config, target, -1)
-        after = _context(index, config, target, +1)
+    for target in np.flatnonzero(held_out == (part == "held_out")).tolist():
+        before = _context(index, config, longest, target, -1)
+        after = _context(index, config, longest, target, +1)
         if before is not None and after is not None and held_out[before] == held_out[after] == held_out[target]:
             samples.append(Sample(recording, target, before, after))
     return samples
@@ -151,12 +140,11 @@ def held_out_sets(index: RecordingIndex, config: RecordingsConfig) -> int:
     return len(index) - first_held_out(index, config.held_out)
 
 
-def _context(index: RecordingIndex, config: RecordingsConfig, target: int, step: int) -> int | None:
-    """Return the nearest set before (step -1) or after (+1) the target that is far enough, None without any."""
+def _context(index: RecordingIndex, config: RecordingsConfig, longest: float, target: int, step: int) -> int | None:
+    """Return the nearest set before (step -1) or after (+1) the target, within seconds, that is far enough, or None."""
     stamps = index.stamps[:, index.anchor]
     other = target + step
-    longest = longest_interval(index, config) * NANOSECONDS
-    while 0 <= other < len(index) and 0 < step * (stamps[other] - stamps[target]) <= longest:
+    while 0 <= other < len(index) and 0 < step * (stamps[other] - stamps[target]) <= longest * NANOSECONDS:
         if _has_moved(index, config, target, other):
             return other
         other += step

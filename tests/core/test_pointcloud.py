@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -101,3 +103,17 @@ def test_thinning_the_merged_cloud_leaves_one_point_per_cube(surround, rig):
     thin = merged_cloud(surround, rig, CloudLimits(max_range=50.0, voxel=2.0))
     np.testing.assert_array_equal(thin, thinned(whole, 2.0))
     assert 0 < len(thin) < 0.7 * len(whole)
+
+
+def test_pixels_that_are_not_sure_enough_make_no_points(surround, rig):
+    confidence = np.random.default_rng(1).random(surround.depth.shape).astype(np.float32)
+    sure = replace(surround, confidence=confidence)
+    known = ~np.isnan(surround.depth) & (confidence >= 0.7)
+    assert len(merged_cloud(sure, rig, CloudLimits(min_confidence=0.7))) == known.sum()
+    np.testing.assert_array_equal(np.isnan(organised_cloud(sure, 2, 0.7)[..., 0]), ~known[2])
+    everything = CloudLimits()
+    np.testing.assert_array_equal(merged_cloud(sure, rig, everything), merged_cloud(surround, rig, everything))
+
+
+def test_where_nothing_is_known_of_confidence_nothing_is_sure(surround, rig):
+    assert len(merged_cloud(surround, rig, CloudLimits(min_confidence=0.1))) == 0

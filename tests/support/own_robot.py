@@ -21,12 +21,12 @@ _NOT_RECORDED = ("/odom", "/tf")
 
 
 def robot() -> RigLayout:
-    """115 degrees of view each, rectified to 110."""
-    focal, rectified = WIDTH / 2 / math.radians(57.5), WIDTH / 2 / math.tan(math.radians(55))
+    """Lenses of 114 degrees, of which P = K shows 90."""
+    focal = WIDTH / 2 / math.radians(57.5)
     x, y = (WIDTH - 1) / 2, (HEIGHT - 1) / 2
     calibration = Calibration(
         width=WIDTH, height=HEIGHT, distortion_model="equidistant", d=(0.01, -0.003, 0.0, 0.0),
-        k=(focal, 0, x, 0, focal, y, 0, 0, 1), p=(rectified, 0, x, 0, 0, rectified, y, 0, 0, 0, 1, 0),
+        k=(focal, 0, x, 0, focal, y, 0, 0, 1), p=(focal, 0, x, 0, 0, focal, y, 0, 0, 0, 1, 0),
     )  # fmt: skip
     cameras = tuple(
         CameraEntry(

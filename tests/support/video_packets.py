@@ -15,14 +15,14 @@ ENCODERS = {"h264": "libx264", "hevc": "libx265"}
 
 
 def encoded(
-    pictures: Sequence[NDArray[np.uint8]], codec: str, b_frames: int = 0, key_every: int = KEY_EVERY
+    pictures: Sequence[NDArray[np.uint8]], codec: str, b_frames: int = 0, key_every: int = KEY_EVERY, crf: int = 5
 ) -> list[bytes]:
     """One packet for each BGR picture."""
     context = av.CodecContext.create(ENCODERS[codec], "w")
     context.height, context.width = pictures[0].shape[:2]
     context.pix_fmt = "yuv420p"
     context.time_base, context.framerate, context.gop_size = Fraction(1, 10), Fraction(10, 1), key_every
-    quality = {"crf": "5", "preset": "veryfast", "x265-params": "log-level=none:bframes=0:scenecut=0"}
+    quality = {"crf": str(crf), "preset": "veryfast", "x265-params": "log-level=none:bframes=0:scenecut=0"}
     context.options = quality if b_frames else {**quality, "tune": "zerolatency"}
     context.max_b_frames = b_frames
     packets = []

@@ -72,9 +72,10 @@ def test_the_lines_of_the_nodes_benchmark_have_all_that_the_table_needs(
 
     found = dict.fromkeys(("median_ms", "p95_ms", "per_second", "outside_inference", "peak_memory_mb"), 2.0)
     found |= {"sets_received": 7, "age_ms": {"p50": 1.0, "p95": 2.0}, "stages_ms": {"inference": {"p50_ms": 1.5}}}
-    monkeypatch.setattr(node, "measured", lambda _: found | {"baseline": found | {"median_ms": 8.0}})
-    monkeypatch.setattr(sys, "argv", ["node.py"])
+    monkeypatch.setattr(node, "measured", lambda *_: found | {"baseline": found | {"median_ms": 8.0}})
+    monkeypatch.setattr(sys, "argv", ["node.py", "--against", "yesterday", "--rounds", "2"])
     node.main()
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert [(line["case"], line["times_baseline"]) for line in lines] == [("straightforward", 1.0), ("node", 4.0)]
+    times = [(line["case"], line["times_baseline"]) for line in lines]
+    assert times == [("straightforward", 1.0), ("node", 4.0), ("node of yesterday", 4.0)]
     assert "medians of 7 rounds" in benchmarks[1].markdown(lines)

@@ -56,3 +56,11 @@ def test_a_confirmed_camera_does_not_confirm_what_another_one_shows_for_a_moment
     measure()
     named = [finding.cameras for finding in monitor._named("misalignment", values, 0.5, 2 * 10**9)]
     assert sorted(named) == [("left",), ("right",)]
+
+
+@pytest.mark.parametrize("stride", [4, 7])
+def test_an_intact_rig_raises_no_alarm_when_few_sets_of_a_looped_drive_are_seen(drive: Any, stride: int):
+    monitor = OverlapMonitor(drive.rig)
+    for number in range(0, 900, stride):
+        monitor.update(drive.sets[number % len(drive.sets)], number * 100_000_000)
+        assert not monitor.findings()

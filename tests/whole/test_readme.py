@@ -7,11 +7,11 @@ what `pip install .` and `colcon build` put into place.
 
 import re
 import shlex
-import subprocess
-import sys
 
 import pytest
 from repository import ROOT
+
+from cvcdepth_ros.bag_replay import main
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 COMMANDS = [
@@ -35,29 +35,25 @@ def test_every_link_to_a_file_leads_somewhere():
     assert [link for link in links if not (ROOT / link).exists()] == []
 
 
-def test_cvcdepth_commands_run_in_the_order_in_which_they_stand(tmp_path):
+def test_cvcdepth_commands_run_in_the_order_in_which_they_stand(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "samples").symlink_to(ROOT / "samples")
     commands = [command for command in COMMANDS if command.startswith("cvcdepth ") and "drives/" not in command]
     assert {shlex.split(command)[1] for command in commands} == {"inspect", "check", "rig", "run", "evaluate", "play"}
     for command in commands:
         if " play " in command:
             continue  # it needs ROS: test_bag_play.py runs it
-        words = [sys.executable, "-m", "cvcdepth_ros.bag_replay", *shlex.split(command)[1:]]
-        done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=100)
-        assert done.returncode == 0, f"{command}\n{done.stderr}"
+        assert main(shlex.split(command)[1:]) == 0, f"{command}\n{capsys.readouterr().err}"
 
 
 @pytest.mark.parametrize("command", [command for command in COMMANDS if "drives/" in command])
-def test_commands_for_the_users_own_drives_have_only_options_that_there_are(command):
+def test_commands_for_the_users_own_drives_have_only_options_that_there_are(command, capsys):
     """test_bag_finetune.py runs them, on the sample and at a small size."""
     _, subcommand, *words = shlex.split(command)
-    done = subprocess.run(
-        [sys.executable, "-m", "cvcdepth_ros.bag_replay", subcommand, "--help"],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert {word for word in words if word.startswith("-")} <= set(re.findall(r"--?[a-z-]+", done.stdout))
+    with pytest.raises(SystemExit):
+        main([subcommand, "--help"])
+    known = set(re.findall(r"--?[a-z-]+", capsys.readouterr().out))
+    assert {word for word in words if word.startswith("-")} <= known
     assert all((ROOT / word).is_file() for word in words if word.startswith("config/"))
 
 

@@ -16,7 +16,9 @@ from cvcdepth_ros.commands import check
 from cvcdepth_ros.evaluation.job import EvaluationSettings
 from cvcdepth_ros.settings import MatchingSettings, MissingCameraSettings, ModelSettings, OutputSettings
 
-NUMBERS = dict(enumerate(["ten", "eleven", "twelve", "thirteen", "fourteen", "fifteen"], 10))
+NUMBERS = dict(
+    enumerate(["ten", "eleven", "twelve", "thirteen", "fourteen", "fifteen", "sixteen", "seventeen", "eighteen"], 10)
+)
 PARAMETERS = ROOT / "config" / "surround_depth.yaml"
 
 

@@ -2,6 +2,7 @@
 """The network that is told its rig: what it is told, what it makes of it, and every engine that runs it."""
 
 import copy
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -17,8 +18,9 @@ from cvcdepth_core.errors import ConfigError, ImageError
 from cvcdepth_core.model_choices import BACKENDS
 from cvcdepth_core.networks import DepthModelSpec, RigImages, build_depth_network, disparity_to_depth
 from cvcdepth_core.networks.checkpoint import load_checkpoint, save_checkpoint
+from cvcdepth_core.networks.mirroring import mirror_rig
 from cvcdepth_core.networks.rig_conditioned import CHANNELS, RigConditionedNet
-from cvcdepth_core.training.augmentation import mirror_rig
+from cvcdepth_ros.bag_replay import main
 
 FIELDS = {"encoder": "efficientnet_lite0", "height": 64, "width": 96, "min_depth": 0.4, "max_depth": 250.0}
 SPEC = DepthModelSpec(network="rig_conditioned", focal_scale=48.0, **FIELDS)
@@ -177,3 +179,22 @@ def test_what_it_is_told_is_made_once_for_each_calibration(network, monkeypatch)
     assert len(calls) == 2
     engine.disparity(rig._replace(base_T_camera=rig.base_T_camera + 0.01))
     assert len(calls) == 4
+
+
+def test_what_export_writes_down_is_enough_to_tell_it_a_rig(network, tmp_path):
+    checkpoint = tmp_path / "model.safetensors"
+    save_checkpoint(checkpoint, SPEC, network.state_dict())
+    assert main(["export", str(checkpoint)]) == 0
+    described = json.loads((tmp_path / "model.json").read_text())
+    rig = ring_of_cameras(SPEC.height, SPEC.width).of_cameras([2])
+    K, pose = rig.intrinsics[0, 0].double().numpy(), rig.base_T_camera[0, 0].double().numpy()
+    v, u = np.mgrid[: SPEC.height, : SPEC.width]
+    x, y = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
+    forward, left, up = np.tensordot(pose[:3, :3], np.stack([x, y, np.ones_like(x)]), axes=1)
+    names = vars(np) | {"x": x, "y": y, "forward": forward, "left": left, "up": up}
+    names |= {"height": pose[2, 3], "fx": K[0, 0], "focal_scale": described["focal_scale"]}
+    for name in ("level", "ground", "near", "below"):
+        names[name] = eval(described["conditioning"][name], {}, names)
+    channels = [eval(text, {}, names) for text in described["conditioning"]["channels"]]
+    found = np.stack([np.broadcast_to(channel, x.shape) for channel in channels])
+    np.testing.assert_allclose(found, network.conditioning(rig)[0, 0].numpy(), rtol=1e-4, atol=1e-5)

@@ -37,7 +37,7 @@ def _seeded():
 def one_sample(batch: RigBatch, prediction: Prediction, index: int) -> tuple[RigBatch, Prediction]:
     keep = slice(index, index + 1)
     fields = {name: getattr(batch, name)[keep] for name in ("frames", "masks", "intrinsics", "base_T_camera")}
-    parts = (getattr(prediction, field.name)[keep] for field in dataclasses.fields(prediction))
+    parts = (part[keep] for part in (prediction.disparity, prediction.depth, prediction.motions))
     return dataclasses.replace(batch, **fields), Prediction(*parts)
 
 

@@ -3,6 +3,7 @@
 
 import itertools
 import json
+import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,11 +16,13 @@ import yaml
 from recordings import CAMERAS, SAMPLE, Entry
 from repository import ROOT
 
+from cvcdepth_core.refinement.mounts import RefinedMounts
 from cvcdepth_core.rig.rig_file import load_rig_layout
 from cvcdepth_core.training.config import load_training_config
 from cvcdepth_ros.bag_replay import main
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.checks import CHECKS, CheckContext, CheckOptions, run_checks
+from cvcdepth_ros.recordings.compared_pictures import ComparedPictures
 from cvcdepth_ros.settings import MatchingSettings
 from cvcdepth_ros.training_data.index import build_index
 from cvcdepth_ros.training_data.sample_choice import find_samples
@@ -73,13 +76,15 @@ PASSED = dict.fromkeys(CHECKS, "passed") | {
     "places": "skipped",
     "training": "warning",  # a second holds too little out for a verdict
     "pose network": "skipped",
+    "mounts": "skipped",
+    "odometry": "skipped",
 }
 
 
 def test_the_sample_passes_and_the_values_are_its_own(check):
     checks = check(SAMPLE)
     assert statuses(checks) == PASSED
-    assert [found["number"] for found in checks.values()] == list(range(1, 15))
+    assert [found["number"] for found in checks.values()] == list(range(1, len(CHECKS) + 1))
     sets = checks["sets"]["values"]
     assert (sets["sets"], sets["first"], sets["last"]) == (10, "back", "right")
     assert sets["spread"] == pytest.approx(0.081, abs=0.001)
@@ -489,9 +494,33 @@ def test_every_recording_is_checked_and_one_that_cannot_be_read_is_named(tmp_pat
     out, err = capsys.readouterr()
     bad, good = json.loads(out)["recordings"]
     assert "begins with" in bad["unreadable"]
-    assert good["counts"] == {"passed": 11, "skipped": 2, "warning": 1}
+    assert good["counts"] == {"passed": 12, "skipped": 4, "warning": 1}
     assert "bad.mcap" in err
     assert "good.mcap" not in err
+
+
+def test_pictures_tell_which_neighbours_disagree_and_the_remedy(check):
+    checks = check(SAMPLE, "--pictures")
+    mounts = checks["mounts"]
+    assert mounts["status"] == "warning"
+    assert re.match(r"neighbours disagree by [01]\.\d degrees \((front_)?right - (front_)?right\)", mounts["finding"])
+    assert "rig BAG --refine" in mounts["remedy"]
+    assert checks["odometry"]["finding"] == "too few sets in a row to tell: 10"
+
+
+@pytest.mark.parametrize(
+    ("has_odometry", "problem", "status"),
+    [(True, "", "passed"), (True, "odometry has another scale", "warning"), (False, "", "skipped")],
+)
+def test_odometry_is_judged_by_what_the_pictures_say(has_odometry: bool, problem: str, status: str):
+    with open_recording(SAMPLE) as recording:
+        context = CheckContext(recording, CheckOptions(pictures=True))
+        assert context.rig is not None
+        nothing = RefinedMounts(np.zeros((6, 4, 4)), np.zeros((6, 3)), ())
+        context.compared = ComparedPictures(context.rig, 12, nothing, problem, has_odometry, has_judged_odometry=True)
+        found = CHECKS["odometry"](context)
+    assert found.status == status
+    assert problem in found.finding
 
 
 def test_the_checks_are_there_for_other_commands():

@@ -40,7 +40,7 @@ SMALL = {
     "pose": {"encoder": "efficientnet_lite0"},
     "recordings": {"held_out": 0.6, "min_travel": 0.1},  # six sets: with fewer there is no verdict
     "optimizer": {"epochs": 1, "samples_per_step": 2},
-    "evaluation": {"max_depth": 80},
+    "evaluation": {"max_depth": 80, "sets": 2},
 }
 CHEAP = ("--skip", "places", "--no-masks")  # what other tests are about
 UNPROVEN = (*CHEAP, "--no-promotion")
@@ -103,7 +103,7 @@ def worse(better, tmp_path_factory) -> Run:
     blind = recordings.write_rosbag2(folder / "blind <b>&", recordings.without(recordings.sample_entries(), "/lidar"))
     optimizer = {"epochs": 6, "samples_per_step": 5, "learning_rate": 0.5}
     recorded = SMALL["recordings"] | {"motion": "auto"}
-    evaluation = {"max_depth": 80, "patience": 2}
+    evaluation = SMALL["evaluation"] | {"patience": 2}
     path = write_config(folder / "finetune.yaml", optimizer=optimizer, evaluation=evaluation, recordings=recorded)
     start = better.folder / "best.safetensors"
     code = finetune(path, folder / "run", "--from", start, *CHEAP, bags=(blind,))
@@ -138,7 +138,7 @@ def test_the_scores_are_those_of_evaluate_on_the_held_out_part(better, tmp_path,
     cameras = metrics["scores"]["image"]["metric"]["cameras"]
     expected = {name: numbers["all"]["abs_rel"] for name, numbers in cameras.items()}
     found = {name: numbers["abs_rel"] for name, numbers in with_start["scores"]["after"]["cameras"].items()}
-    assert found.pop("back") == pytest.approx(expected.pop("back"), rel=1e-4)  # its roof is masked in the run
+    assert found.pop("back") == pytest.approx(expected.pop("back"), rel=1e-3)  # its roof is masked in the run
     assert found == pytest.approx(expected, rel=1e-6)
 
 
@@ -149,7 +149,7 @@ def test_weights_say_what_they_and_their_start_were_trained_on_and_not_what_was_
     assert trained_parts(load_checkpoint(better.folder / "start.safetensors")) == []
     inherited, own = trained_parts(load_checkpoint(worse.folder / "last.safetensors"))
     assert inherited == part
-    assert (own.recording, own.sets_among(stamps)) == ("blind <b>&", 7)
+    assert (own.recording, own.sets_among(stamps)) == ("blind <b>&", 4)
 
 
 def front_stamps() -> list[int]:
@@ -209,7 +209,7 @@ def test_weights_of_a_run_whose_state_was_removed_are_not_taken_for_this_ones(co
     best.parent.mkdir()
     best.write_bytes(b"learned from other recordings")
     one_step = config(optimizer={"epochs": 1, "samples_per_step": 9}, recordings={"held_out": 0, "min_travel": 0.1})
-    assert finetune(one_step, tmp_path / "run", *CHEAP) == NOT_PROMOTED
+    assert finetune(one_step, tmp_path / "run", *UNPROVEN) == FINISHED
     assert not best.exists()
 
 
@@ -523,7 +523,8 @@ def test_what_a_recording_lost_is_told_and_not_counted_as_held_out(config, tmp_p
         entries[i] = entries[i]._replace(cdr=bytes(JAZZY.serialize_cdr(content, entries[i].type)))
     blind = recordings.write_rosbag2(tmp_path / "blind", entries)
     (blind / "blind_1.mcap").write_bytes(b"")
-    one_step = config(optimizer={"epochs": 1, "samples_per_step": 9})
+    third = {"held_out": 0.3, "min_travel": 0.1}
+    one_step = config(optimizer={"epochs": 1, "samples_per_step": 9}, recordings=third)
     skipped = ("--skip", "brightness", *CHEAP)
     assert finetune(one_step, tmp_path / "run", *skipped, bags=(SAMPLE, blind)) in (PROMOTED, NOT_PROMOTED)
     lost = f"{blind}: not everything could be read: {blind}: metadata.yaml does not list blind_1.mcap, not read"

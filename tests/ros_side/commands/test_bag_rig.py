@@ -11,7 +11,7 @@ import pytest
 import recordings
 from recordings import CAMERAS, JAZZY, SAMPLE
 
-from cvcdepth_core.rig.rig_file import load_rig_layout
+from cvcdepth_core.rig.rig_file import PoseEntry, load_rig_layout, save_rig_layout
 from cvcdepth_ros.bag_replay import main
 
 
@@ -178,3 +178,47 @@ def test_too_short_a_recording_is_said_to_be_too_short_for_masks(tmp_path, capsy
     error = capsys.readouterr().err
     assert "short.mcap: no masks: " in error
     assert "pairs of pictures between which the vehicle moved 0.5 m, to look for its own body 8 are needed" in error
+
+
+def test_a_camera_that_is_turned_against_its_mount_is_found_and_turned_back(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    layout = load_rig_layout(write_rig(SAMPLE, tmp_path / "rig.yaml"))
+    pitched = np.eye(4)
+    pitched[:3, :3] = cv2.Rodrigues(np.radians([0.8, 0.0, 0.0]))[0]
+    cameras = [
+        camera.model_copy(update={"base_T_camera": PoseEntry.from_matrix(camera.base_T_camera.matrix("") @ pitched)})
+        if camera.name == "front_left"
+        else camera
+        for camera in layout.cameras
+    ]
+    save_rig_layout(tmp_path / "turned.yaml", layout.model_copy(update={"cameras": tuple(cameras)}), "")
+    capsys.readouterr()
+    refined = write_rig(SAMPLE, tmp_path / "refined.yaml", "--rig", str(tmp_path / "turned.yaml"), "--refine", "--json")
+    told = json.loads(capsys.readouterr().out)["refined"]
+    turn = np.array(told["turns"]["front_left"])
+    np.testing.assert_allclose(turn, [-0.8, 0.1, 0.0], atol=0.15)  # the sample's own is off by a tenth
+    assert told["turns"]["front"] == [0.0, 0.0, 0.0]
+    pair = next(p for p in told["pairs"] if (p["camera"], p["neighbour"]) == ("left", "front_left"))
+    assert pair["after"] > pair["before"] + 0.1
+    mounts = [load_rig_layout(path).complete().cameras[1].base_T_camera for path in (tmp_path / "rig.yaml", refined)]
+    apart = np.degrees(np.linalg.norm(cv2.Rodrigues(mounts[0][:3, :3].T @ mounts[1][:3, :3])[0]))
+    assert apart < 0.25
+
+
+@pytest.mark.parametrize(
+    ("sets", "reason"),
+    [
+        (2, "2 sets, more than 4 in a row are needed to compare pictures"),
+        (5, "--refine: no pair of neighbours tells how its cameras are turned: "),
+    ],
+)
+def test_pictures_that_do_not_tell_how_cameras_are_turned_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], sets: int, reason: str
+):
+    grey = cv2.imencode(".jpg", np.full((540, 960, 3), 90, np.uint8))[1].ravel()
+    entries = recordings.sample_entries(sets)
+    for camera in CAMERAS:
+        topic = f"/camera/{camera}/image_raw/compressed"
+        entries = list(recordings.changed(entries, topic, lambda message: setattr(message, "data", grey)))
+    assert reason in refusal(recordings.write_rosbag2(tmp_path / "grey", entries), tmp_path, capsys, "--refine")

@@ -13,7 +13,7 @@ pytest.importorskip("embreex", reason="worlds need embreex")
 
 from own_robot import YAWS, recorded_drive
 
-from cvcdepth_core.rig.rig_file import CameraEntry, RigLayout, load_rig_layout
+from cvcdepth_core.rig.rig_file import load_rig_layout
 from cvcdepth_ros.bag_replay import main
 from cvcdepth_ros.settings import NodeParameters
 
@@ -34,9 +34,10 @@ def commands(program: str) -> list[list[str]]:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Holds the recording, and after the first test what the commands wrote."""
     folder = tmp_path_factory.mktemp("robot")
-    recorded_drive(folder, 0.8)
+    recorded_drive(folder, 1.2)
     (configuration,) = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
-    (folder / "robot_training.yaml").write_text(configuration)
+    # Of a second of driving a quarter would be too little to prove anything by.
+    (folder / "robot_training.yaml").write_text(configuration.replace("held_out: 0.25", "held_out: 0.5"))
     return folder
 
 
@@ -44,10 +45,16 @@ def test_the_commands_lead_from_a_recording_to_a_trained_network(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.chdir(folder)
-    done = {words[0]: main(words) for words in commands("cvcdepth")}
-    assert list(done) == ["inspect", "check", "rig", "run", "evaluate", "finetune"]
-    assert done.pop("finetune") in (0, NOT_PROMOTED), capsys.readouterr().err
-    assert set(done.values()) == {0}, capsys.readouterr().err
+    words = commands("cvcdepth")
+    assert [word[0] for word in words] == ["inspect", "check", "rig", "check", "run", "evaluate", "finetune"]
+    codes = list(map(main, words))
+    assert codes[:-1] == [0, 1, 0, 0, 0, 0], capsys.readouterr().err
+    assert codes[-1] in (0, NOT_PROMOTED), capsys.readouterr().err
+    told = re.sub(r"\s+", " ", capsys.readouterr().out)
+    assert (
+        "a7, b2, c9, d4 shares no view with another camera -> show all of each lens (`cvcdepth rig BAG --view" in told
+    )
+    assert "4 of 114 degrees, shown whole" in told
     layout = load_rig_layout(folder / "robot_rig.yaml")
     assert (layout.base_frame, set(layout.names)) == ("chassis", set(YAWS))
     assert Path("trained", "candidate.safetensors").is_file()
@@ -66,13 +73,6 @@ def test_the_node_has_the_parameters_that_the_page_gives_it():
     given = [word.partition(":=")[0] for words in commands("ros2") for word in words if ":=" in word]
     assert given
     assert set(given) <= NodeParameters.model_fields.keys()
-
-
-def test_the_page_tells_every_field_of_a_rig_file():
-    table = PAGE.partition("## The rig file")[2]
-    fields = {*RigLayout.model_fields, *CameraEntry.model_fields}
-    assert set(re.findall(r"^\| (`.*?`) \|", table, re.MULTILINE)) >= {f"`{field}`" for field in ("anchor", "cameras")}
-    assert {field for field in fields if f"`{field}`" not in table} == set()
 
 
 def test_the_pages_configuration_is_the_shipped_one_but_for_size_and_length():

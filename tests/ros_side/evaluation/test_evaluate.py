@@ -42,6 +42,7 @@ from cvcdepth_ros.reports.shown_sets import chosen_sets
 
 SMALL = ("--untrained", "--height", "64", "--width", "96")
 CONSTANT = ("--predictor", "constant", "--height", "96", "--width", "160")
+FUSIONS = ((), ("--flip-fusion",), ("--flip-fusion", "--flip-fusion-of", "inverse_depth"))
 Rows = dict[tuple[str, int, str], dict[str, str]]
 
 
@@ -79,12 +80,15 @@ def two_sets(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # The same depth everywhere
 
 
-def test_run_and_evaluate_give_the_same_depth_bit_for_bit(two_sets: Path, tmp_path: Path):
-    job = EvaluationJob("two_sets", str(two_sets), EvaluationSettings(untrained=True, height=64, width=96))
+@pytest.mark.parametrize("fused", [False, True])
+def test_run_and_evaluate_give_the_same_depth_bit_for_bit(two_sets: Path, fused: bool, tmp_path: Path):
+    settings = EvaluationSettings(untrained=True, height=64, width=96, flip_fusion=fused)
+    job = EvaluationJob("two_sets", str(two_sets), settings)
     with open_evaluation(job) as evaluation:
         scored = [measured.estimated.result.depth for measured in evaluation.sets(*evaluation.window)]
     assert len(scored) == 2
-    assert main(["run", str(two_sets), "-o", str(tmp_path / "depth"), *SMALL]) == 0
+    fusion = ["--flip-fusion"] if fused else []
+    assert main(["run", str(two_sets), "-o", str(tmp_path / "depth"), *SMALL, *fusion]) == 0
     for index, name in enumerate(CAMERAS):
         stored = depth_images(tmp_path / "depth", f"/surround_depth/{name}/depth/image_rect")
         np.testing.assert_array_equal([depth[index] for depth in scored], stored)
@@ -116,6 +120,34 @@ def test_confidence_is_scored_without_refinement_too_and_leaves_depth_as_it_is(t
     assert sum(count > 0 for count in pixels) > 2
     again = score(tmp_path / "sure", two_sets, *SMALL, "--confidence")
     assert again["confidence"] == result["confidence"]
+
+
+def test_flip_fusion_is_of_depth_or_of_inverse_depth_and_told(two_sets: Path, tmp_path: Path):
+    plain, depth, inverse = (
+        score(tmp_path / str(number), two_sets, *SMALL, *options)
+        for number, options in enumerate(
+            ((), ("--flip-fusion",), ("--flip-fusion", "--flip-fusion-of", "inverse_depth"))
+        )
+    )
+    errors = [result["scores"]["image"]["metric"]["mean"]["all"]["abs_rel"] for result in (plain, depth, inverse)]
+    assert len(set(errors)) == 3
+    assert errors[1] < errors[2]  # all depths are too small, and the mean of two is above their harmonic mean
+    assert [result["model"]["id"].partition(", flip fusion of ")[2] for result in (depth, inverse)] == [
+        "depth",
+        "inverse depth",
+    ]
+
+
+def test_the_pose_network_is_compared_with_recorded_motion_where_there_is_any(tmp_path: Path):
+    entries = recordings.sample_entries(4)
+    moving = recordings.write_rosbag2(tmp_path / "moving", entries)
+    blind = recordings.write_rosbag2(tmp_path / "blind", [e for e in entries if e.topic not in ("/tf", "/odom")])
+    known, unknown = (score(tmp_path / f"of_{one.name}", one)["pose_network"] for one in (moving, blind))
+    assert known["steps"] == 3
+    assert 0.9 < known["recorded_metres"] < 1.6
+    assert 0.5 < known["ratio"] < 1.3  # it has seen the sample
+    assert known["degrees"] < 0.3
+    assert unknown == {"steps": 0, "predicted_metres": None, "recorded_metres": None, "degrees": None, "ratio": None}
 
 
 def test_a_reference_is_never_refined(two_sets: Path, tmp_path: Path):

@@ -5,10 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from recordings import SAMPLE
 from simple_worlds import LENSES, short_drive, two_cameras
 
 from cvcdepth_core.errors import RecordingError
 from cvcdepth_core.scoring.sparse_depth import SparseDepth
+from cvcdepth_ros.bag_replay import main
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings
 from cvcdepth_ros.evaluation.measuring import MeasuredSet, open_evaluation
@@ -102,3 +104,9 @@ def test_a_recording_without_true_depth_is_refused_with_topic_and_remedy(tmp_pat
             RecordingError, match=r"no true depth on /camera/front/truth/depth, .*as `simulate` records"
         ):
             RecordedDepthImages(recorded)
+
+
+def test_lidar_options_have_no_meaning_with_true_depth(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit):
+        main(["evaluate", str(SAMPLE), "--truth", "depth", "--no-lidar", "-o", str(tmp_path)])
+    assert "--truth depth: depth images are the truth, so --lidar and --no-lidar" in capsys.readouterr().err

@@ -18,9 +18,9 @@ from cvcdepth_ros.training_data.sample_choice import (
     describe_motion,
     describe_unprovable,
     find_samples,
+    find_variants,
     held_out_sets,
     refuse_standstill,
-    sample_variants,
 )
 from cvcdepth_ros.training_data.samples import SampleReader
 
@@ -120,8 +120,7 @@ def test_every_epoch_draws_how_far_each_targets_contexts_are(index):
     further = RECORDED.model_copy(update={"further_travels": (0.6, 1.2)})
     batches = RecordingBatches([index], config(further))
     assert batches.samples == len(batches) == 8
-    variants = [sample_variants(index, further, sample) for sample in batches.targets]
-    assert [len(of) for of in variants] == [1, 2, 2, 3, 3, 3, 2, 1]
+    assert [len(of_target) for of_target in find_variants(index, further)] == [1, 2, 2, 3, 3, 3, 2, 1]
     taken = {
         (target.target, round(float(batch.context_times[0, 1]), 1))
         for epoch in range(6)
@@ -136,7 +135,7 @@ def test_every_epoch_draws_how_far_each_targets_contexts_are(index):
 
 def test_predicted_motion_knows_near_contexts_only(index):
     further = RecordingsConfig(held_out=0.0, further_travels=(0.6,))
-    assert [len(sample_variants(index, further, one)) for one in find_samples(index, further, "training")] == [1] * 8
+    assert [len(of_target) for of_target in find_variants(index, further)] == [1] * 8
 
 
 def test_contexts_beyond_the_greatest_travel_are_left_out_by_its_number(index):

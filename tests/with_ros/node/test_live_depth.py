@@ -18,6 +18,7 @@ from cvcdepth_ros.surround_sets.synchronizer import SurroundSynchronizer
 
 pytest.importorskip("rclpy", reason="these tests need a ROS environment")
 
+from nav_msgs.msg import Odometry
 from rclpy.serialization import deserialize_message
 from ros_graph import RosGraph, reliable
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
@@ -119,3 +120,22 @@ def test_run_and_the_live_node_refine_the_same_sets_alike_bit_for_bit(graph: Ros
             np.testing.assert_array_equal(values, stored[stamp])
         assert any(values.any() for values in published.values())
     graph.await_status("refinement", "earlier pictures by odometry, and neighbours")
+
+
+def test_motion_from_the_pictures_is_published_where_it_is_asked_for(graph: RosGraph, tmp_path: Path):
+    rig, recording = tmp_path / "rig.yaml", tmp_path / "some_sets"
+    recordings.write_rosbag2(recording, recordings.sample_entries(4))
+    assert main(["rig", str(recording), "-o", str(rig)]) == 0
+    entries = [entry for entry in recordings.sample_entries(4) if entry.type in CLASSES]
+    publishers = {e.topic: graph.node.create_publisher(CLASSES[e.type], e.topic, reliable()) for e in entries}
+    graph.subscribe(Odometry, "/surround_depth/odometry")
+    graph.start_node(rig=rig, publish_odometry=True, max_age=0.0, reliable=True)
+    graph.await_matches(publishers.values())
+    graph.spin_until(lambda: graph.node.count_publishers("/surround_depth/odometry"), "the topic")
+    for entry in sorted(entries, key=lambda entry: "CameraInfo" not in entry.type):
+        publishers[entry.topic].publish(deserialize_message(entry.cdr, CLASSES[entry.type]))
+    graph.spin_until(lambda: graph.received["/surround_depth/odometry"], "odometry")
+    message = graph.received["/surround_depth/odometry"][-1]
+    assert (message.header.frame_id, message.child_frame_id) == ("visual_odom", "base_link")
+    assert 3.0 < message.twist.twist.linear.x < 7.0  # 5 m/s
+    assert 0 < message.twist.covariance[0] < 1.0

@@ -28,7 +28,8 @@ from cvcdepth_core.networks import DepthNet
 from cvcdepth_core.networks.checkpoint import save_checkpoint
 from cvcdepth_core.networks.registry import DepthModelSpec
 
-SMALL = {"untrained": True, "height": 96, "width": 160, "max_age": 0.0}
+# The engine that is there at once: another takes a second to convert the network and compare it.
+SMALL = {"untrained": True, "height": 96, "width": 160, "max_age": 0.0, "backend": "torch_eager"}
 FIRING_ORDER = ("back", "left", "front_left", "front", "front_right", "right")
 
 
