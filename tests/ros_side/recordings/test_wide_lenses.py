@@ -11,18 +11,22 @@ import torch
 
 pytest.importorskip("embreex", reason="worlds need embreex")
 
-from fisheye_drive import LENS_DEG, VIEWS, fisheye_rig, record_fisheyes
+from fisheye_drive import HEIGHT, LENS_DEG, VIEWS, WIDTH, fisheye_rig, fisheye_spec, record_fisheyes
 
 from cvcdepth_core.errors import RigError
 from cvcdepth_core.refinement.mounts import RefinedMounts
+from cvcdepth_core.rig.calibration import calibration_from_fields
 from cvcdepth_core.rig.poses import pose_from_quaternion
-from cvcdepth_core.rig.rig_file import RigLayout, load_rig_layout, save_rig_layout
+from cvcdepth_core.rig.rig_file import PoseEntry, RigLayout, load_rig_layout, save_rig_layout
 from cvcdepth_core.rig_health.overlap_monitor import OverlapMonitor
 from cvcdepth_core.scoring.references import constant_depth
 from cvcdepth_core.training.config import RecordingsConfig
 from cvcdepth_core.training.objective import ObjectiveConfig, Prediction, evaluate_objective
+from cvcdepth_core.worlds.drive import SimulatedDrive
 from cvcdepth_ros.bag_replay import main
 from cvcdepth_ros.bags import open_recording
+from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings
+from cvcdepth_ros.evaluation.measuring import open_evaluation
 from cvcdepth_ros.messages import conversion
 from cvcdepth_ros.recordings.compared_pictures import turned_layout
 from cvcdepth_ros.recordings.replay import DepthReplay, SurroundReplay
@@ -231,3 +235,25 @@ def test_evaluate_scores_every_view_against_the_lidar(drive: Path, tmp_path: Pat
     assert main(["evaluate", str(drive), "-o", str(tmp_path / "out"), *options]) == 0
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert sorted(metrics["recordings"][0]["cameras"]) == NAMES
+
+
+def test_the_true_depth_of_a_view_is_that_of_a_pinhole_camera_in_its_place(tmp_path: Path):
+    lens = fisheye_rig(cameras=(("ahead", 0.0),))
+    folder = record_fisheyes(tmp_path / "fisheye", lens, sets=1, truth="depth")
+    job = EvaluationJob("drive", str(folder), EvaluationSettings(truth="depth", predictor="constant"))
+    with open_evaluation(job) as evaluation:
+        (measured,) = evaluation.sets(*evaluation.window)
+    for camera, truth in zip(measured.estimated.rig.cameras, measured.truth, strict=True):
+        plain = {"k": camera.calibration.rectified_intrinsics.ravel().tolist(), "width": WIDTH, "height": HEIGHT}
+        pinhole = lens.cameras[0].model_copy(
+            update={
+                "calibration": calibration_from_fields(camera.name, plain),
+                "base_T_camera": PoseEntry.from_matrix(camera.base_T_camera),
+            }
+        )
+        drive = SimulatedDrive(fisheye_spec(lens.model_copy(update={"cameras": (pinhole,)}), sets=1))
+        wanted = drive.shoot(0, 0).truth.depth
+        there = wanted[truth.rows, truth.columns]
+        errors = abs(truth.depth / there - 1)[np.isfinite(there)]
+        assert len(errors) > 500
+        assert np.median(errors) < 0.02  # the raw picture's pixels are as wide as the view's
