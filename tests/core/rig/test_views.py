@@ -164,7 +164,7 @@ def test_a_view_that_would_be_called_as_another_camera_is_refused_by_name():
     layout = four(170)
     renamed = layout.cameras[1].model_copy(update={"name": "front_l"})
     with pytest.raises(
-        RigError, match="camera front: its lens would be shown by front_l, .*there is a camera front_l;"
+        RigError, match=r"camera front: its lens would be shown by front_l, .*there is a camera front_l;"
     ):
         with_views(layout.model_copy(update={"cameras": (layout.cameras[0], renamed)}), {"front": 170.0})
 
