@@ -18,6 +18,7 @@ import multiprocessing
 import os
 import time
 from collections.abc import Callable, Iterator
+from functools import lru_cache
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any
 
@@ -86,7 +87,7 @@ def measured(network: tuple[str, int, int], options: argparse.Namespace) -> Iter
             timings[case].wall.append(wall)
             timings[case].cpu.append(cpu)
     memory = {case: worker.ask(finish=True) for case, worker in workers.items()}
-    work_flop, limit = floating_point_operations(network), gigaflops_of_matrix_product()
+    limit = gigaflops_of_matrix_product() if options.device == "cpu" else None
     names = {case: " ".join(map(str, case)) for case in cases}
     lines = json_lines("estimator", {names[case]: timings[case] for case in cases}, names[BASELINE], {}, options.device)
     for case, line in zip(cases, lines, strict=True):
@@ -98,14 +99,20 @@ def measured(network: tuple[str, int, int], options: argparse.Namespace) -> Iter
                 | {
                     "times_eager": round(times_quicker(timings[eager].wall, timings[case].wall), 3),
                     "times_eager_cpu": round(times_quicker(timings[eager].cpu, timings[case].cpu), 3),
-                    "gflop_per_cpu_s": round(work_flop / timings[case].median_cpu / 1e9, 1),
-                    "of_matrix_product": round(work_flop / timings[case].median_cpu / 1e9 / limit, 3),
+                    **(rate_of(network, timings[case].median_cpu, limit) if limit else {}),
                     "relative_depth_difference_p99.9": float(f"{difference(depths[case], depths[eager]):.2g}"),
                     "peak_memory_mb": round(memory[case]),
                 }
             )
 
 
+def rate_of(network: tuple[str, int, int], cpu_seconds: float, limit: float) -> dict[str, float]:
+    """Say how many GFLOP a second are done, and of how many that could be."""
+    rate = 1e-9 * floating_point_operations(network) / cpu_seconds
+    return {"gflop_per_cpu_s": round(rate, 1), "of_matrix_product": round(rate / limit, 3)}
+
+
+@lru_cache
 def floating_point_operations(network: tuple[str, int, int]) -> float:
     """Return what the convolutions of the network as it was trained ask for, for all cameras.
 

@@ -55,10 +55,7 @@ class View(BaseModel):
         Where the images are `rectified` already, the calibration's K is what was P, without distortion.
         """
         if rectified:
-            K = calibration.model_copy(update={"k": _rectified_k(calibration)}) if any(calibration.p) else calibration
-            calibration = K.model_copy(
-                update={"distortion_model": "plumb_bob", "d": (), "r": (1.0, 0, 0, 0, 1, 0, 0, 0, 1)}
-            )
+            calibration = _without_lens(calibration)
         base_R_camera = base_T_camera[:3, :3]
         base_T_view = base_T_camera.copy()
         base_T_view[:3, :3] = _turn_left(self.yaw) @ base_R_camera
@@ -108,8 +105,11 @@ def network_part(calibration: Calibration, height: int, width: int, aspect: Aspe
     return PicturePart(float(left), float(top), *shown.tolist())
 
 
-def _rectified_k(calibration: Calibration) -> tuple[float, ...]:
-    return tuple(np.array(calibration.p).reshape(3, 4)[:, :3].ravel().tolist())
+def _without_lens(calibration: Calibration) -> Calibration:
+    """Return the calibration of images that are rectified already: P is their K, and nothing distorts or turns them."""
+    k = tuple(np.array(calibration.p).reshape(3, 4)[:, :3].ravel().tolist()) if any(calibration.p) else calibration.k
+    plain = {"distortion_model": "plumb_bob", "d": (), "r": (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)}
+    return calibration.model_copy(update={"k": k, **plain})
 
 
 def _turn_left(degrees: float) -> NDArray[np.float64]:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 
+from cvcdepth_core.errors import RigError
 from cvcdepth_core.rig.calibration import Calibration
 from cvcdepth_core.rig.lens import field_of_view
 from cvcdepth_core.rig.rig_file import CameraEntry, RigLayout
@@ -66,11 +67,19 @@ def _neighbours(entry: CameraEntry, name: str, names: list[str]) -> tuple[str, .
 def with_views(layout: RigLayout, hfov: Mapping[str, float]) -> RigLayout:
     """Return the layout with so many degrees shown of the named cameras' lenses, see `split`; the others as they are.
 
-    Anchor and neighbours that are split become the middle view (of two, the left one), and all views.
+    Anchor and neighbours that are split become the middle view (of two, the left one), and all views. RigError where a
+    view would be called as another camera is.
     """
     parts = {c.name: split(c, hfov[c.name]) if c.name in hfov else (c,) for c in layout.cameras}
     names = {name: [part.name for part in found] for name, found in parts.items()}
     cameras = tuple(_renamed(part, names) for found in parts.values() for part in found)
+    for name, views in names.items():
+        taken = {*views} & {other for lens, others in names.items() if lens != name for other in others}
+        if taken:
+            raise RigError(
+                f"camera {name}: its lens would be shown by {', '.join(views)}, but there is a camera "
+                f"{', '.join(sorted(taken))}; a rig file gives it another name, or a view of up to 120 degrees"
+            )
     anchor = layout.anchor and names[layout.anchor][(len(names[layout.anchor]) - 1) // 2]
     return layout.model_copy(update={"cameras": cameras, "anchor": anchor})
 

@@ -107,10 +107,14 @@ def _thumbnails(context: CheckContext, log_times: set[int], anchor: str) -> Iter
         return
     topic = next(camera.image_topic for camera in layout.cameras if camera.name == anchor)
     for message in context.recording.messages([topic], min(log_times), max(log_times) + 1):
-        if message.log_time in log_times:
+        if message.log_time not in log_times:
+            continue
+        try:
             thumbnail = thumbnail_of(context.recording.deserialize(message), anchor)
-            if thumbnail is not None:
-                yield message.log_time, thumbnail
+        except RecordingError:
+            continue
+        if thumbnail is not None:
+            yield message.log_time, thumbnail
 
 
 def _pose_score(context: CheckContext, index: RecordingIndex) -> PoseScore | None:

@@ -99,7 +99,10 @@ def turned_layout(layout: RigLayout, mounts: RefinedMounts) -> RigLayout:
     """Return the layout, which is complete, with the mounts that were found; views of one lens turn together."""
     rig, poses = layout.complete(), dict[int, Pose]()
     for lens in rig.lenses:
-        turn = _mean_turn([mounts.base_T_camera[i] @ inverse(rig.cameras[i].base_T_camera) for i in lens])
+        # The anchor keeps its mount, and with it the other views of its lens.
+        judged = [i for i in lens if not np.isnan(mounts.turns[i]).any()]
+        told = [i for i in judged if rig.names[i] == rig.anchor] or judged
+        turn = _mean_turn([mounts.base_T_camera[i] @ inverse(rig.cameras[i].base_T_camera) for i in told])
         for i in lens:
             is_plain = len(lens) == 1 and layout.cameras[i].view is None
             poses[i] = mounts.base_T_camera[i] if is_plain else _turned(layout.cameras[i], turn)
@@ -111,8 +114,8 @@ def turned_layout(layout: RigLayout, mounts: RefinedMounts) -> RigLayout:
 
 
 def _mean_turn(motions: Sequence[Pose]) -> NDArray[np.float64]:
-    """Return the rotation [3, 3] nearest to the mean of those of the poses (Moakher 2002)."""
-    u, _, v = np.linalg.svd(np.mean([motion[:3, :3] for motion in motions], axis=0))
+    """Return the rotation [3, 3] nearest to the mean of those of the poses (Moakher 2002); of none, no turn."""
+    u, _, v = np.linalg.svd(np.mean([motion[:3, :3] for motion in motions] or [np.eye(3)], axis=0))
     turn: NDArray[np.float64] = u @ v
     return turn
 

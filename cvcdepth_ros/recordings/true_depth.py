@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ground truth from depth images that were recorded beside the pictures, as simulators record it. No ROS here."""
+"""Ground truth from depth images that were recorded beside the pictures, as simulators record it. No ROS here.
+
+Several views of one lens have its image, each along its own axis.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,7 @@ from numpy.typing import NDArray
 from cvcdepth_core.errors import ImageError, RecordingError
 from cvcdepth_core.images.rectifier import raw_pixels
 from cvcdepth_core.rig.rig import Camera, Rig
+from cvcdepth_core.rig.wide_lenses import lens_name
 from cvcdepth_core.scoring.sparse_depth import OcclusionFilter, SparseDepth
 from cvcdepth_ros.bags import RecordedMessage
 from cvcdepth_ros.messages.conversion import stamp_ns
@@ -51,7 +55,9 @@ class RecordedDepthImages(RecordedMotion):
     def __init__(self, recorded: RecordedRig) -> None:
         """RecordingError names the topic of a camera that has no true depth."""
         super().__init__(recorded)
-        names = recorded.layout.names
+        images = recorded.layout.views_by_image.values()
+        self._lenses = {name: lens_name(names) for names in images for name in names}
+        names = list(dict.fromkeys(self._lenses.values()))
         self._cameras = {depth_topic(name): name for name in names}
         self._movers = {moving_topic(name): name for name in names if moving_topic(name) in self._recording.topics}
         missing = [topic for topic in self._cameras if topic not in self._recording.topics]
@@ -62,7 +68,7 @@ class RecordedDepthImages(RecordedMotion):
             )
         self.topics = tuple(self._cameras)
         self.ahead_ns = _LATE_NS
-        self._offsets = {entry.name: entry.stamp_offset_ns for entry in recorded.layout.cameras}
+        self._offsets = {self._lenses[entry.name]: entry.stamp_offset_ns for entry in recorded.layout.cameras}
         self._images: dict[str, dict[int, Any]] = defaultdict(dict)
         self.handlers: Mapping[str, Callable[[RecordedMessage], None]] = {
             **dict.fromkeys((*self._cameras, *self._movers), self._add_image),
@@ -91,11 +97,12 @@ class RecordedDepthImages(RecordedMotion):
         return SparseDepth(empty, empty, np.zeros(0), height, width)
 
     def _image(self, camera: str, shape: tuple[int, int], time: int) -> _TrueImage:
-        found = self._images[depth_topic(camera)].get(time)
+        lens = self._lenses[camera]
+        found = self._images[depth_topic(lens)].get(time)
         if found is None:
             raise ImageError(f"camera {camera}: no true depth with the stamp of its picture, {time} ns")
         depth = _pixels(found, camera, "32FC1", "<f4", shape)
-        moving = self._images[moving_topic(camera)].get(time)
+        moving = self._images[moving_topic(lens)].get(time)
         movers = np.zeros(shape, np.uint8) if moving is None else _pixels(moving, camera, "mono8", "u1", shape)
         return _TrueImage(depth.astype(np.float32), movers > 0)
 

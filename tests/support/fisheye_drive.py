@@ -12,7 +12,7 @@ from cvcdepth_core.rig.rig_file import CameraEntry, PoseEntry, RigLayout
 from cvcdepth_core.worlds.drive import DriveSpec
 from cvcdepth_core.worlds.sensors import Lidar, Sensors
 from cvcdepth_ros.simulation.recording import record
-from cvcdepth_ros.simulation.set_messages import Form
+from cvcdepth_ros.simulation.set_messages import Form, TruthChoice
 
 LENS_DEG = 170.0
 WIDTH, HEIGHT = 128, 80
@@ -43,11 +43,12 @@ def fisheye_rig(
     return RigLayout(cameras=tuple(entries))
 
 
-def record_fisheyes(folder: Path, layout: RigLayout | None = None, sets: int = 4) -> Path:
-    """Record the drive with raw pictures and a LiDAR."""
+def fisheye_spec(layout: RigLayout, sets: int) -> DriveSpec:
     sensors = Sensors(stagger=0.0, lidar=Lidar(beams=8, columns=240))
-    spec = DriveSpec(
-        layout=layout or fisheye_rig(), world=street_spec(), sensors=sensors, seconds=sets / sensors.rate, samples=1
-    )
-    record(spec, Form(images="raw", truth="none"), folder)
+    return DriveSpec(layout=layout, world=street_spec(), sensors=sensors, seconds=sets / sensors.rate, samples=1)
+
+
+def record_fisheyes(folder: Path, layout: RigLayout | None = None, sets: int = 4, truth: TruthChoice = "none") -> Path:
+    """Record the drive with raw pictures and a LiDAR."""
+    record(fisheye_spec(layout or fisheye_rig(), sets), Form(images="raw", truth=truth), folder)
     return folder

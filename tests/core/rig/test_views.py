@@ -160,6 +160,20 @@ def test_views_are_named_left_middle_and_right_and_are_neighbours():
     np.testing.assert_allclose(yaws, [50, 0, -50], atol=0.2)
 
 
+def test_a_view_that_would_be_called_as_another_camera_is_refused_by_name():
+    layout = four(170)
+    renamed = layout.cameras[1].model_copy(update={"name": "front_l"})
+    with pytest.raises(
+        RigError, match=r"camera front: its lens would be shown by front_l, .*there is a camera front_l;"
+    ):
+        with_views(layout.model_copy(update={"cameras": (layout.cameras[0], renamed)}), {"front": 170.0})
+
+
+def test_views_of_one_lens_are_one_lens():
+    rig = with_views(four(170), {"front": 170.0}).complete()
+    assert rig.lenses == [[0, 1, 2], [3], [4], [5]]
+
+
 def test_anchor_and_given_neighbours_follow_a_split():
     layout = four(170)
     cameras = tuple(c.model_copy(update={"neighbours": ("front",)}) if c.name == "left" else c for c in layout.cameras)

@@ -10,9 +10,10 @@ from recordings import SAMPLE
 
 from cvcdepth_core.images.rectifier import Rectifier, raw_pixels
 from cvcdepth_core.images.surround import self_occlusion_mask
-from cvcdepth_core.rig.calibration import calibration_from_fields
+from cvcdepth_core.rig.calibration import Calibration, calibration_from_fields
 from cvcdepth_core.rig.rig import Camera
-from cvcdepth_core.rig.rig_file import RigLayout, load_rig_layout
+from cvcdepth_core.rig.rig_file import CameraEntry, PoseEntry, RigLayout, load_rig_layout
+from cvcdepth_core.rig.view import View
 from cvcdepth_core.rig_health.own_body import MIN_PAIRS, SelfOcclusionFinder
 from cvcdepth_ros.bag_replay import main
 
@@ -44,6 +45,10 @@ def scene_found(rig_file: Path, moving: np.ndarray, contrast: np.ndarray | float
     layout = load_rig_layout(rig_file)
     unmasked = tuple(camera.model_copy(update={"mask": None}) for camera in layout.cameras)
     finder = SelfOcclusionFinder(layout.model_copy(update={"cameras": unmasked}).complete())
+    return scene_of(finder, moving, contrast)
+
+
+def scene_of(finder: SelfOcclusionFinder, moving: np.ndarray, contrast: np.ndarray | float = 1.0) -> np.ndarray:
     cameras, height, width = finder.preprocessor.valid.shape
     random = np.random.default_rng(0)
 
@@ -65,6 +70,26 @@ def test_a_still_strip_that_reaches_the_border_is_the_vehicle(masked_rig: Path):
     scene = scene_found(masked_rig, moving)
     assert not scene[:, 180:].any()
     assert scene[:, :155].all()
+
+
+def test_a_body_at_the_lower_border_of_what_a_fisheye_shows_is_the_vehicle():
+    lens = Calibration(
+        width=640, height=320, distortion_model="equidistant", d=(0.0,) * 4, k=(290, 0, 319.5, 0, 290, 159.5, 0, 0, 1)
+    )
+    pose = PoseEntry(translation=(1.0, 0.0, 1.5), rotation=(-0.5, 0.5, -0.5, 0.5))
+    camera = CameraEntry(
+        name="front", image_topic="/image", camera_info_topic="/info", calibration=lens, base_T_camera=pose,
+        view=View(hfov=120),
+    )  # fmt: skip
+    finder = SelfOcclusionFinder(RigLayout(cameras=(camera,)).complete())
+    (shown,) = finder.preprocessor.valid
+    bottom = len(shown) - 1 - shown[::-1].argmax(axis=0)
+    assert bottom[192] < len(shown) - 20, "the picture's lowest rows show nothing in the middle"
+    rows, columns = np.mgrid[: shown.shape[0], : shown.shape[1]]
+    body = (rows > bottom - 40) & (abs(columns - 192) < 60)
+    (scene,) = scene_of(finder, ~body)
+    assert (~scene)[body & shown].mean() > 0.7
+    assert scene[~body & (rows < bottom - 50)].all()
 
 
 def test_what_stands_still_inside_the_picture_drives_along_and_is_scene(masked_rig: Path):

@@ -8,6 +8,7 @@ from torch.nn.functional import interpolate
 
 from cvcdepth_core.errors import ConfigError
 from cvcdepth_core.rig.pinhole import PinholeView
+from cvcdepth_core.rig.view import PicturePart
 from cvcdepth_core.scoring import sparse_depth as sparse_depth_module
 from cvcdepth_core.scoring.ground_truth import overlap_pixels, sample_prediction, sparse_depth
 from cvcdepth_core.scoring.sparse_depth import OcclusionFilter, SparseDepth
@@ -123,6 +124,17 @@ def test_a_prediction_with_holes_has_none_exactly_where_it_would_be_interpolated
     assert np.isnan(sampled).sum() == 16
     same_size = sample_prediction(prediction, SparseDepth.from_image(np.ones((4, 4))))
     assert np.isnan(same_size).sum() == 1
+
+
+def test_a_prediction_of_a_part_is_sampled_there_and_is_none_elsewhere():
+    """Rows are cut off above and below, and columns are added left and right that show nothing."""
+    truth = SparseDepth.from_image(np.ones((8, 8)))
+    prediction = np.tile(np.arange(4.0), (4, 1)).T
+    cropped = sample_prediction(prediction, truth, PicturePart(0, 2, 8, 4)).reshape(8, 8)
+    assert np.isnan(cropped[[0, 1, 6, 7]]).all()
+    np.testing.assert_allclose(cropped[2:6], np.tile(np.arange(4.0)[:, None], (1, 8)))
+    padded = sample_prediction(prediction.T, truth, PicturePart(-4, 0, 16, 8)).reshape(8, 8)
+    np.testing.assert_allclose(padded[3], [0.625, 0.875, 1.125, 1.375, 1.625, 1.875, 2.125, 2.375])
 
 
 def test_truth_as_an_image_and_back_is_the_same():

@@ -316,17 +316,19 @@ def test_without_tensorboard_a_line_says_so_once(config, tmp_path, capsys, monke
 
 def test_torchrun_trains_with_two_processes_as_one_does_with_their_samples(config, tmp_path):
     everything = {"held_out": 0.0, "min_travel": 0.1}
+    short = recordings.write_rosbag2(tmp_path / "short", recordings.sample_entries(6))  # two steps of two samples
     path = config(optimizer=SMALL["optimizer"] | {"samples_per_batch": 2}, recordings=everything)
-    assert finetune(path, tmp_path / "alone", *UNPROVEN) == FINISHED
+    assert finetune(path, tmp_path / "alone", *UNPROVEN, bags=(short,)) == FINISHED
     path = config(optimizer=SMALL["optimizer"], recordings=everything)
     torchrun = ["torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "cvcdepth_ros.bag_replay"]
-    program = [sys.executable, "-m", *torchrun, *command(path, tmp_path / "both", "--json", *UNPROVEN)]
+    both = command(path, tmp_path / "both", "--json", *UNPROVEN, bags=(short,))
+    program = [sys.executable, "-m", *torchrun, *both]
     finished = subprocess.run(program, capture_output=True, text=True, check=False)
     assert finished.returncode == 0, finished.stderr
     result = json.loads(finished.stdout)
     logs = [Run(tmp_path / run, path, 0).log for run in ("alone", "both")]
     one, two = ([entry["loss"] for entry in log] for log in logs)
-    assert len(one) == len(two) == result["steps"]
+    assert len(one) == len(two) == result["steps"] == 2
     assert two[0] == pytest.approx(one[0], rel=1e-3)  # Adam makes of rounding whole steps; see test_distributed.py
 
 

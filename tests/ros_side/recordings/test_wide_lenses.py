@@ -4,23 +4,31 @@
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
 pytest.importorskip("embreex", reason="worlds need embreex")
 
-from fisheye_drive import LENS_DEG, VIEWS, fisheye_rig, record_fisheyes
+from fisheye_drive import HEIGHT, LENS_DEG, VIEWS, WIDTH, fisheye_rig, fisheye_spec, record_fisheyes
 
 from cvcdepth_core.errors import RigError
+from cvcdepth_core.refinement.mounts import RefinedMounts
+from cvcdepth_core.rig.calibration import calibration_from_fields
 from cvcdepth_core.rig.poses import pose_from_quaternion
-from cvcdepth_core.rig.rig_file import load_rig_layout, save_rig_layout
+from cvcdepth_core.rig.rig_file import PoseEntry, RigLayout, load_rig_layout, save_rig_layout
+from cvcdepth_core.rig_health.overlap_monitor import OverlapMonitor
 from cvcdepth_core.scoring.references import constant_depth
 from cvcdepth_core.training.config import RecordingsConfig
 from cvcdepth_core.training.objective import ObjectiveConfig, Prediction, evaluate_objective
+from cvcdepth_core.worlds.drive import SimulatedDrive
 from cvcdepth_ros.bag_replay import main
 from cvcdepth_ros.bags import open_recording
+from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings
+from cvcdepth_ros.evaluation.measuring import open_evaluation
 from cvcdepth_ros.messages import conversion
+from cvcdepth_ros.recordings.compared_pictures import turned_layout
 from cvcdepth_ros.recordings.replay import DepthReplay, SurroundReplay
 from cvcdepth_ros.recordings.rig import RecordedRig
 from cvcdepth_ros.settings import MatchingSettings
@@ -188,6 +196,33 @@ def test_views_of_one_lens_have_no_baseline_and_are_trained_on_all_the_same(driv
     assert {"spatial", "depth_consistency"} <= value.terms.keys()
 
 
+def test_views_of_one_lens_are_no_evidence_of_its_mount(drive: Path):
+    with open_recording(drive) as recording:
+        rig = RecordedRig.from_recording(recording).layout.complete()
+    assert {(a[:-2], b[:-2]) for a, b in OverlapMonitor(rig).pairs()} <= {("ahead", "port"), ("port", "ahead")}
+
+
+def test_views_of_one_lens_are_turned_together(drive: Path):
+    with open_recording(drive) as recording:
+        layout = RecordedRig.from_recording(recording).layout
+    rig = layout.complete()
+    turn, _ = cv2.Rodrigues(np.array([0.0, 0.0, 0.02]))
+    poses = np.stack([camera.base_T_camera for camera in rig.cameras])
+    turned = poses.copy()
+    for i, name in enumerate(rig.names):
+        if name in ("port_l", "port_m"):
+            turned[i, :3, :3] = turn @ poses[i, :3, :3]
+    turns = np.array([[np.nan] * 3 if name == "port_r" else [0.0] * 3 for name in rig.names])
+    found = turned_layout(layout, RefinedMounts(turned, turns, ()))
+    after = {
+        camera.name: camera.base_T_camera for camera in RigLayout.model_validate(found.model_dump()).complete().cameras
+    }
+    for i, name in enumerate(rig.names):
+        wanted = turn @ poses[i, :3, :3] if name.startswith("port") else poses[i, :3, :3]
+        np.testing.assert_allclose(after[name][:3, :3], wanted, atol=1e-9)
+        np.testing.assert_allclose(after[name][:3, 3], poses[i, :3, 3], atol=1e-9)
+
+
 def test_a_lens_whose_views_share_nothing_but_with_each_other_teaches_no_scale(drive: Path, tmp_path: Path):
     alone = fisheye_rig(cameras=(("ahead", 0.0),))
     folder = record_fisheyes(tmp_path / "alone", alone, sets=2)
@@ -200,3 +235,25 @@ def test_evaluate_scores_every_view_against_the_lidar(drive: Path, tmp_path: Pat
     assert main(["evaluate", str(drive), "-o", str(tmp_path / "out"), *options]) == 0
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert sorted(metrics["recordings"][0]["cameras"]) == NAMES
+
+
+def test_the_true_depth_of_a_view_is_that_of_a_pinhole_camera_in_its_place(tmp_path: Path):
+    lens = fisheye_rig(cameras=(("ahead", 0.0),))
+    folder = record_fisheyes(tmp_path / "fisheye", lens, sets=1, truth="depth")
+    job = EvaluationJob("drive", str(folder), EvaluationSettings(truth="depth", predictor="constant"))
+    with open_evaluation(job) as evaluation:
+        (measured,) = evaluation.sets(*evaluation.window)
+    for camera, truth in zip(measured.estimated.rig.cameras, measured.truth, strict=True):
+        plain = {"k": camera.calibration.rectified_intrinsics.ravel().tolist(), "width": WIDTH, "height": HEIGHT}
+        pinhole = lens.cameras[0].model_copy(
+            update={
+                "calibration": calibration_from_fields(camera.name, plain),
+                "base_T_camera": PoseEntry.from_matrix(camera.base_T_camera),
+            }
+        )
+        drive = SimulatedDrive(fisheye_spec(lens.model_copy(update={"cameras": (pinhole,)}), sets=1))
+        wanted = drive.shoot(0, 0).truth.depth
+        there = wanted[truth.rows, truth.columns]
+        errors = abs(truth.depth / there - 1)[np.isfinite(there)]
+        assert len(errors) > 500
+        assert np.median(errors) < 0.02  # the raw picture's pixels are as wide as the view's
