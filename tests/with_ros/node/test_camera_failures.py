@@ -119,8 +119,7 @@ def test_a_camera_that_changes_its_calibration_goes_on_with_the_new_one(scene):
     received = scene.graph.received[info_topic]
 
     def shows(info: CameraInfo) -> bool:
-        height = 64 / info.height  # the network's picture is as high as the whole, and cut off at its sides
-        return bool(received) and received[-1].k[4] == pytest.approx(info.k[4] * height)
+        return bool(received) and received[-1].k[0] == pytest.approx(info.k[0] * 96 / info.width)
 
     scene.cameras.run_until(lambda: shows(wider), "the new focal length")
     scene.cameras.infos["left"] = good
