@@ -374,7 +374,7 @@ NO_RECORDINGS = {
         "a.db3: not readable as a rosbag2 database",
     ),
     "cut ROS 1 bag": (
-        lambda path: recordings.cut(recordings.ros1_copy(path / "whole.bag", sets=1), path / "a.bag"),
+        lambda path: recordings.cut(recordings.ros1_copy(path / "whole.bag", sets=1), path / "a.bag", 0.005),
         "holds no readable message .*a.bag: cut or unreadable from byte",
     ),
 }
