@@ -62,7 +62,8 @@ test-ros: $(DEV) messages ## the tests in tests/with_ros, with ROS 2 from wheels
 
 test-core: $(CORE) ## all other tests, in an environment without ROS
 	@if .venv-core/bin/python -c 'import rclpy' 2>/dev/null; then echo "rclpy is in .venv-core: make clean"; exit 1; fi
-	.venv-core/bin/python -m pytest $(BESIDE) --ignore tests/with_ros
+	.venv-core/bin/python -m pytest $(BESIDE) tests/core tests/faults
+	.venv-core/bin/python -m pytest $(BESIDE) tests/ros_side tests/whole
 
 test-faults: $(DEV) ## inject every fault into node and tool; the table of reactions in output/faults.md
 	@mkdir -p output && rm -f output/faults.md
