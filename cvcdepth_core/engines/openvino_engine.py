@@ -3,8 +3,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import importlib
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -68,10 +71,36 @@ class OpenVinoEngine:
                 "NUM_STREAMS": streams,
                 "ENABLE_CPU_PINNING": False,  # other threads need the cores
             }
-            compiled = self._core.compile_model(model, "CPU", options)
-            self._queue = self._openvino.AsyncInferQueue(compiled, streams)
+            with _signal_stack_kept():
+                compiled = self._core.compile_model(model, "CPU", options)
+                self._queue = self._openvino.AsyncInferQueue(compiled, streams)
             self._size, self._streams = size, streams
         return self._queue
+
+
+class _SignalStack(ctypes.Structure):
+    """`stack_t` of sigaltstack(2)."""
+
+    _fields_ = (("pointer", ctypes.c_void_p), ("flags", ctypes.c_int), ("size", ctypes.c_size_t))
+
+
+@contextmanager
+def _signal_stack_kept() -> Iterator[None]:
+    """Leave this thread's alternate signal stack as it was.
+
+    OpenVINO's CPU plugin puts one of its own in its place and frees that later. The next signal with a handler, such as
+    the end of a child process, then ends the program without a word.
+    """
+    sigaltstack = getattr(ctypes.CDLL(None), "sigaltstack", None)
+    if sigaltstack is None:
+        yield
+        return
+    before = _SignalStack()
+    sigaltstack(None, ctypes.byref(before))
+    try:
+        yield
+    finally:
+        sigaltstack(ctypes.byref(before), None)
 
 
 def _import_openvino() -> Any:

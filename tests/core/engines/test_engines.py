@@ -257,6 +257,34 @@ def test_an_openvino_that_cannot_be_imported_is_told_in_one_line(monkeypatch: py
 
 
 @needs_openvino
+def test_openvino_leaves_the_stack_of_signals_as_it_was():
+    """Else a child that ends, after the engine is gone, ends this process too: faulthandler's stack was replaced."""
+    script = (
+        "import faulthandler, gc, signal, subprocess, sys, torch\n"
+        "faulthandler.enable()\n"
+        "signal.signal(signal.SIGCHLD, lambda *_: None)\n"
+        "from cvcdepth_core.engines.openvino_engine import OpenVinoEngine, _SignalStack\n"
+        "import ctypes\n"
+        "def stack():\n"
+        "    found = _SignalStack()\n"
+        "    ctypes.CDLL(None).sigaltstack(None, ctypes.byref(found))\n"
+        "    return found.pointer\n"
+        "from cvcdepth_core.networks.depth import DepthNet\n"
+        "from cvcdepth_core.networks.registry import DepthModelSpec\n"
+        "before = stack()\n"
+        "spec = DepthModelSpec(encoder='efficientnet_lite0', height=64, width=96, min_depth=1.5, max_depth=200.0)\n"
+        "engine = OpenVinoEngine(DepthNet('efficientnet_lite0').eval(), spec)\n"
+        "engine._queue_for(torch.zeros(2, 3, 64, 96))\n"
+        "print(stack() == before)\n"
+        "del engine; gc.collect()\n"
+        "subprocess.run([sys.executable, '-c', ''], check=True)\n"
+        "print('alive')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.stdout.split() == ["True", "alive"], done.stderr
+
+
+@needs_openvino
 def test_openvino_is_loaded_without_its_telemetry():
     script = (
         "import sys\nfrom cvcdepth_core.engines.openvino_engine import _import_openvino\n"
