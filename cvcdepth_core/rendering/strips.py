@@ -7,7 +7,7 @@ mask zero, so that nothing there enters a masked mean.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -68,14 +68,14 @@ class Strips:
         """Return the strips [..., S, C, H, w] of `images` [..., N, C, H, W]."""
         if self.are_whole_images:
             return images
-        strips: Tensor = _Cut.apply(images, self)  # type: ignore[no-untyped-call]
+        strips: Tensor = _Linear.apply(images, self.copy_cut, self.copy_paste)  # type: ignore[no-untyped-call]
         return strips
 
     def paste(self, strips: Tensor) -> Tensor:
         """Return images [..., N, C, H, W] that are zero beside these `strips` [..., S, C, H, w]."""
         if self.are_whole_images:
             return strips
-        images: Tensor = _Paste.apply(strips, self)  # type: ignore[no-untyped-call]
+        images: Tensor = _Linear.apply(strips, self.copy_paste, self.copy_cut)  # type: ignore[no-untyped-call]
         return images
 
     def of_pairs(self, strips: Tensor) -> Tensor:
@@ -154,28 +154,20 @@ def divide_into_strips(seen: Sequence[Interval], targets: Sequence[int], cameras
     return groups
 
 
-class _Cut(torch.autograd.Function):
+class _Linear(torch.autograd.Function):
+    """A linear function whose gradient its adjoint gives."""
+
     @staticmethod
-    def forward(ctx: Any, images: Tensor, strips: Strips) -> Tensor:
-        ctx.strips = strips
-        return strips.copy_cut(images)
+    def forward(
+        ctx: Any, values: Tensor, function: Callable[[Tensor], Tensor], adjoint: Callable[[Tensor], Tensor]
+    ) -> Tensor:
+        ctx.adjoint = adjoint
+        return function(values)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
-        return ctx.strips.copy_paste(grad), None
-
-
-class _Paste(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, strips: Tensor, of: Strips) -> Tensor:
-        ctx.strips = of
-        return of.copy_paste(strips)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
-        return ctx.strips.copy_cut(grad), None
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+        return ctx.adjoint(grad), None, None
 
 
 @torch.no_grad()
