@@ -16,7 +16,7 @@ from cvcdepth_core.model_choices import FlipFusion, Precision
 from cvcdepth_core.networks import DepthNetwork, build_depth_network, disparity_to_depth
 from cvcdepth_core.networks.checkpoint import load_checkpoint
 from cvcdepth_core.networks.mirroring import fuse_with_mirrored, mirrored_pictures
-from cvcdepth_core.networks.registry import RIG_CONDITIONED, DepthModelSpec
+from cvcdepth_core.networks.registry import DepthModelSpec
 from cvcdepth_core.rig.ground import refuse_unlikely_ground
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.surround_depth import SurroundDepth, SurroundPictures
@@ -152,7 +152,7 @@ class SurroundDepthEstimator:
 
         RigError names the camera where the network is told the rig, and the rig cannot be right about the ground.
         """
-        if isinstance(estimator, DepthEstimator) and estimator.spec.network == RIG_CONDITIONED:
+        if isinstance(estimator, DepthEstimator) and estimator.spec.is_told_its_rig:
             refuse_unlikely_ground(rig)
         self.rig = rig
         self.estimator = estimator

@@ -52,6 +52,11 @@ class DepthModelSpec(BaseModel):
         """What messages call the network: its encoder, after its name where it is not the published one."""
         return self.encoder if self.network == PER_CAMERA else f"{self.network}, {self.encoder}"
 
+    @property
+    def is_told_its_rig(self) -> bool:
+        """Whether the network is told where its cameras are above the ground; rigs that have that wrong are refused."""
+        return self.network == RIG_CONDITIONED
+
     @field_validator("network")
     @classmethod
     def _network_is_known(cls, network: str) -> str:
@@ -68,7 +73,7 @@ class DepthModelSpec(BaseModel):
 
     @model_validator(mode="after")
     def _encoder_is_the_networks(self) -> DepthModelSpec:
-        if self.network == RIG_CONDITIONED and self.encoder != RigConditionedNet.ENCODER:
+        if self.is_told_its_rig and self.encoder != RigConditionedNet.ENCODER:
             raise ValueError(
                 f"encoder is {self.encoder}, but the network {RIG_CONDITIONED} has {RigConditionedNet.ENCODER}"
             )

@@ -49,7 +49,7 @@ def pretrain(job: PretrainJob, processes: Processes, warn: Callable[[str], None]
     batches = WorldBatches(job.shards, job.config, processes)
     device = own_device(resolve_device(job.device))
     score = ViewScores(batches.held_out, job.config, device) if batches.held_out.views else None
-    if job.config.depth.network != RIG_CONDITIONED:
+    if not job.config.depth.is_told_its_rig:
         warn(f"depth.network is not {RIG_CONDITIONED}: a network that is not told its rig learns no rig's scale")
     trainer = Trainer(
         job.config,

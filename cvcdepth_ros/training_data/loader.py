@@ -14,7 +14,6 @@ import torch
 from torch.utils.data import DataLoader
 
 from cvcdepth_core.errors import RecordingError, RigError
-from cvcdepth_core.networks.registry import RIG_CONDITIONED
 from cvcdepth_core.rig.ground import refuse_unlikely_ground
 from cvcdepth_core.training.batch import RigBatch
 from cvcdepth_core.training.config import RecordingsConfig, TrainingConfig
@@ -60,7 +59,7 @@ class RecordingBatches:
         RigError names recording and camera where the network is told a rig that cannot be right about the ground.
         """
         _refuse_unrecorded_motion(indexes, config.recordings)
-        if config.depth.network == RIG_CONDITIONED:
+        if config.depth.is_told_its_rig:
             _refuse_unlikely_ground(indexes)
         refuse_standstill(indexes, config.recordings)
         variants = [
