@@ -52,6 +52,20 @@ def rig_layout(arguments: argparse.Namespace) -> "RigLayout | None":
     return load_rig_layout(arguments.rig) if arguments.rig else None
 
 
+def add_training_run(parser: argparse.ArgumentParser, shipped: str, start: str) -> None:
+    """Declare the run's folder, its configuration (`shipped` names one), and what it starts from (`start`: help)."""
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="RUN", help="the run's folder")
+    parser.add_argument(
+        "--config",
+        required=True,
+        metavar="FILE",
+        help=f"training configuration (YAML), or a shipped one by name: {shipped}",
+    )
+    starts = parser.add_mutually_exclusive_group(required=True)
+    starts.add_argument("--from", dest="start", metavar="CHECKPOINT", help=start)
+    starts.add_argument("--from-scratch", action="store_true", help="start from random weights")
+
+
 def add_quiet(parser: argparse.ArgumentParser) -> None:
     """Declare `--quiet`."""
     parser.add_argument("--quiet", action="store_true", help="no progress bar")

@@ -14,6 +14,7 @@ from cvcdepth_ros.commands.arguments import (
     add_recordings,
     add_rig,
     add_skip,
+    add_training_run,
     lidar_topics,
     refuse_unknown_checks,
     rig_layout,
@@ -47,18 +48,7 @@ _RESULT_FILE = "finetune.json"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_recordings(parser)
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="RUN", help="the run's folder")
-    parser.add_argument(
-        "--config",
-        required=True,
-        metavar="FILE",
-        help="training configuration (YAML), or a shipped one by name: finetune",
-    )
-    start = parser.add_mutually_exclusive_group(required=True)
-    start.add_argument(
-        "--from", dest="start", metavar="CHECKPOINT", help="weights to start from; 'default' are the package's own"
-    )
-    start.add_argument("--from-scratch", action="store_true", help="start from random weights")
+    add_training_run(parser, "finetune", "weights to start from; 'default' are the package's own")
     add_rig(parser)
     parser.add_argument(
         "--no-masks", action="store_true", help="do not look for the vehicle's own body in the recordings"

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from cvcdepth_core.errors import ConfigError
-from cvcdepth_ros.commands.arguments import add_json, add_quiet, training_file
+from cvcdepth_ros.commands.arguments import add_json, add_quiet, add_training_run, training_file
 from cvcdepth_ros.console import print_result, warn
 
 SUMMARY = """Train depth on simulated drives, where it is known exactly, for any rig.
@@ -23,16 +23,7 @@ EXAMPLES: tuple[str, ...] = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("shards", type=Path, nargs="+", metavar="SHARDS", help="folder of simulate --many")
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="RUN", help="the run's folder")
-    parser.add_argument(
-        "--config",
-        required=True,
-        metavar="FILE",
-        help="training configuration (YAML), or a shipped one by name: pretrain",
-    )
-    start = parser.add_mutually_exclusive_group(required=True)
-    start.add_argument("--from", dest="start", metavar="CHECKPOINT", help="weights to start from, as of `import`")
-    start.add_argument("--from-scratch", action="store_true", help="start from random weights")
+    add_training_run(parser, "pretrain", "weights to start from, as of `import`")
     parser.add_argument("--device", default="auto", help="auto (CUDA where there is one), cpu, cuda, cuda:1 ... [auto]")
     add_quiet(parser)
     add_json(parser)
