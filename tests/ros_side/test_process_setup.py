@@ -1,17 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """What programs do to their process before they begin."""
 
-import os
 import platform
 import re
-import subprocess
-import sys
 
 import pytest
+from program_setup import WATCH_TORCH, output_of
 
 from cvcdepth_ros.process_setup import openmp_environment
 
 needs_glibc = pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc has arenas and mallopt")
+
+PROGRAM = """
+from cvcdepth_ros.bag_replay import main
+main(["export", "no_such_file.safetensors"])
+"""
 
 ARENAS = """
 import ctypes, threading
@@ -45,25 +48,6 @@ np.ones(200 << 17)
 print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 """
 
-LOADING_TORCH = """
-import importlib.abc, os, sys
-
-class Watch(importlib.abc.MetaPathFinder):
-    def find_spec(self, name, path=None, target=None):
-        if name == "torch":
-            print("torch:", os.environ.get("GOMP_SPINCOUNT"))
-
-sys.meta_path.insert(0, Watch())
-from cvcdepth_ros.bag_replay import main
-main(["export", "no_such_file.safetensors"])
-"""
-
-
-def output_of(script: str, **environment: str) -> str:
-    without = {name: value for name, value in os.environ.items() if not name.startswith(("GOMP", "OMP", "MALLOC"))}
-    command = [sys.executable, "-c", script]
-    return subprocess.run(command, env=without | environment, check=True, capture_output=True, text=True).stdout
-
 
 @needs_glibc
 @pytest.mark.parametrize("setup", ["prepare_process", "prepare_long_work"])
@@ -89,4 +73,4 @@ def test_openmps_threads_sleep_unless_the_user_says_how_they_wait() -> None:
 
 @pytest.mark.parametrize(("environment", "found"), [({}, "0"), ({"GOMP_SPINCOUNT": "7"}, "7")])
 def test_the_tool_says_how_threads_wait_before_it_loads_torch(environment: dict[str, str], found: str) -> None:
-    assert f"torch: {found}\n" in output_of(LOADING_TORCH, **environment)
+    assert f"torch: {found}\n" in output_of(WATCH_TORCH + PROGRAM, **environment)
