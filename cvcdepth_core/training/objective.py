@@ -65,6 +65,9 @@ class ObjectiveConfig(BaseModel):
     """Weight of the sky: that depth is far there, and that the network says so if it can."""
     truth_uncertainty: float = Field(default=0.05, ge=0)
     """Weight of how well the network foretells its own error, if it does."""
+    leave_out_sky: bool = False
+    """Compare no pictures and no depth where the network says that there is the sky, and smooth nothing across its
+    outline: without parallax nothing holds it where it is. Of networks that tell the sky; truth has to teach it."""
     depth_warping: Literal["ddcl", "dcl"] = "ddcl"
     """How the neighbour's depth comes to the camera: dense backward warping (DDCL) or sparse splatting (DCL)."""
     corrected: bool = False
@@ -191,7 +194,7 @@ def evaluate_objective(
     with torch.autocast(batch.frames.device.type, enabled=False):
         terms = _self_supervised_terms(batch, prediction, config, identity_noise) if len(batch.contexts[0]) else {}
         if batch.truth is not None and config.truth > 0:
-            terms |= _truth_terms(batch.truth, prediction)
+            terms |= _truth_terms(batch.truth, prediction, batch.truth_is_sparse)
         return ObjectiveValue(per_sample=_weighted_total(terms, config).mean(dim=1), terms=terms)
 
 
@@ -202,6 +205,8 @@ def _self_supervised_terms(
     if config.corrected:
         batch = _with_binary_masks(batch)
     views = synthesise_views(batch, prediction, config)
+    if config.leave_out_sky and prediction.sky is not None:
+        batch = _without_sky(batch, prediction.sky)  # after the views: what is projected into the sky is wrong there
     errors = _masked_errors(batch, prediction, views, config, identity_noise)
     terms = {name: weighted_mean(*_added_up(part.sums() for part in parts)) for name, parts in errors.items()}
     if "reconstruction_consistency" in terms:
@@ -217,14 +222,13 @@ def _self_supervised_terms(
     return terms
 
 
-def _truth_terms(truth: Tensor, prediction: Prediction) -> dict[str, Tensor]:
+def _truth_terms(truth: Tensor, prediction: Prediction, is_sparse: bool) -> dict[str, Tensor]:
+    """Return the terms of truth; sparse truth tells neither outlines nor the sky."""
     errors = LogErrors.of(prediction.depth, truth)
-    terms = {
-        "truth": errors.mean(),
-        "truth_shape": errors.deviation(),
-        "truth_outlines": errors.of_steps(),
-        "truth_sky": sky_error(prediction.depth, prediction.sky, truth),
-    }
+    terms = {"truth": errors.mean(), "truth_shape": errors.deviation()}
+    if not is_sparse:
+        terms["truth_outlines"] = errors.of_steps()
+        terms["truth_sky"] = sky_error(prediction.depth, prediction.sky, truth)
     if prediction.log_uncertainty is not None:
         terms["truth_uncertainty"] = errors.surprise(prediction.log_uncertainty)
     return terms
@@ -239,6 +243,12 @@ def _with_binary_masks(batch: RigBatch) -> RigBatch:
     binary = batch.to()
     binary.masks = (batch.masks >= 0.5).to(batch.masks)
     return binary
+
+
+def _without_sky(batch: RigBatch, sky: Tensor) -> RigBatch:
+    shown = batch.to()
+    shown.masks = batch.masks * (sky.detach() < 0).to(batch.masks)
+    return shown
 
 
 def synthesise_views(batch: RigBatch, prediction: Prediction, config: ObjectiveConfig) -> Views:
