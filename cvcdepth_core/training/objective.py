@@ -93,7 +93,8 @@ class Prediction:
 
     def first_sample(self) -> Prediction:
         """Return the output for the first sample, without its gradient."""
-        return Prediction(*(part[:1].detach() for part in (self.disparity, self.depth, self.motions)))
+        parts = (self.disparity, self.depth, self.motions, self.sky)
+        return Prediction(*(None if part is None else part[:1].detach() for part in parts))
 
 
 @dataclass(frozen=True)
@@ -205,8 +206,7 @@ def _self_supervised_terms(
     if config.corrected:
         batch = _with_binary_masks(batch)
     views = synthesise_views(batch, prediction, config)
-    if config.leave_out_sky and prediction.sky is not None:
-        batch = _without_sky(batch, prediction.sky)  # after the views: what is projected into the sky is wrong there
+    batch = _compared(batch, prediction, config)
     errors = _masked_errors(batch, prediction, views, config, identity_noise)
     terms = {name: weighted_mean(*_added_up(part.sums() for part in parts)) for name, parts in errors.items()}
     if "reconstruction_consistency" in terms:
@@ -245,10 +245,16 @@ def _with_binary_masks(batch: RigBatch) -> RigBatch:
     return binary
 
 
-def _without_sky(batch: RigBatch, sky: Tensor) -> RigBatch:
-    shown = batch.to()
-    shown.masks = batch.masks * (sky.detach() < 0).to(batch.masks)
-    return shown
+def _compared(batch: RigBatch, prediction: Prediction, config: ObjectiveConfig) -> RigBatch:
+    """Return the batch with masks of the target's pixels that are compared.
+
+    Views are rendered before: what depth projects into the neighbour's sky is wrong, and has to be seen.
+    """
+    if not config.leave_out_sky or prediction.sky is None:
+        return batch
+    compared = batch.to()
+    compared.masks = batch.masks * (prediction.sky.detach() < 0).to(batch.masks)
+    return compared
 
 
 def synthesise_views(batch: RigBatch, prediction: Prediction, config: ObjectiveConfig) -> Views:
@@ -396,7 +402,7 @@ def masked_errors(
     Those of `reconstruction_consistency` are [B, F, N, 1, H, W]: the frames are averaged after the masked mean. Where
     no neighbour can be seen, the error of a term of the overlap is zero.
     """
-    errors = _masked_errors(batch, prediction, views, config, identity_noise)
+    errors = _masked_errors(_compared(batch, prediction, config), prediction, views, config, identity_noise)
     wholes = {name: _added_up(part.whole() for part in parts) for name, parts in errors.items()}
     return {name: (error, mask) for name, (error, mask) in wholes.items()}
 
