@@ -40,12 +40,15 @@ class PoseConfig(_Section):
 
 
 class AugmentationConfig(_Section):
-    """Changes to the images that the networks see; the losses compare the unchanged ones."""
+    """Changes to samples; but for `zoom`, the losses compare the unchanged pictures."""
 
     color_jitter: ColorJitterConfig = ColorJitterConfig()
     """Random colour changes, per camera."""
     flip: FlipMode = "both"
     """Hflip-S: which networks see half of the samples mirrored."""
+    zoom: float = Field(default=1.0, ge=1, le=4)
+    """Of recordings: a random window of each camera's pictures takes their place, down to one of this many parts of
+    their width, with its own calibration, so that there are other lenses to learn from; 1 takes whole pictures."""
 
 
 class RecordingsConfig(_Section):
@@ -184,7 +187,7 @@ class TrainingConfig(_Section):
     objective: ObjectiveConfig = ObjectiveConfig()
     """Weights and variants of the loss."""
     augmentation: AugmentationConfig = AugmentationConfig()
-    """Changes to the images that the networks see; the losses compare the unchanged ones."""
+    """Changes to samples."""
     recordings: RecordingsConfig = RecordingsConfig()
     """For `dataset: recording`: which moments become samples, and how they are read."""
     worlds: WorldsConfig = WorldsConfig()

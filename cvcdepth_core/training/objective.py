@@ -40,6 +40,8 @@ class ObjectiveConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
+    temporal: float = Field(default=1.0, ge=0)
+    """Weight of the photometric error of views rendered from the camera's own pictures at the context moments."""
     smoothness: float = Field(default=0.1, ge=0)
     """Weight of the edge-aware smoothness of the disparity."""
     spatial: float = Field(default=0.03, ge=0)
@@ -176,7 +178,7 @@ class ObjectiveValue:
     per_sample: Tensor
     """[B] weighted total of each sample, the mean over its cameras."""
     terms: Mapping[str, Tensor]
-    """[B, N] unweighted value of each term, by the names of `ObjectiveConfig`, and `temporal`."""
+    """[B, N] unweighted value of each term, by the names of `ObjectiveConfig`."""
 
     @property
     def loss(self) -> Tensor:
@@ -212,7 +214,7 @@ def _self_supervised_terms(
     if "reconstruction_consistency" in terms:
         terms["reconstruction_consistency"] = terms["reconstruction_consistency"].mean(dim=1)
     if config.smoothness > 0:
-        shown = batch.masks if config.corrected else None
+        shown = batch.masks if config.corrected or config.leave_out_sky else None
         terms["smoothness"] = smoothness(prediction.disparity, batch.images, shown)
     if config.pose_consistency > 0:
         seen = motions_seen_from_anchor(prediction.motions, batch.base_T_camera, batch.anchor)
@@ -235,7 +237,7 @@ def _truth_terms(truth: Tensor, prediction: Prediction, is_sparse: bool) -> dict
 
 
 def _weighted_total(terms: Mapping[str, Tensor], config: ObjectiveConfig) -> Tensor:
-    weights = {"temporal": 1.0, **config.model_dump(include=set(terms))}
+    weights = config.model_dump(include=set(terms))
     return torch.stack([weights[name] * term for name, term in terms.items()]).sum(dim=0)
 
 

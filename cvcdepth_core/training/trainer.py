@@ -28,7 +28,7 @@ from tqdm import tqdm
 from cvcdepth_core.errors import ConfigError, TrainingError
 from cvcdepth_core.networks.checkpoint import save_checkpoint
 from cvcdepth_core.processor import BFLOAT16, multiplies_bfloat16
-from cvcdepth_core.training.augmentation import draw_flips, jitter_colors
+from cvcdepth_core.training.augmentation import draw_flips, jitter_colors, zoom_in
 from cvcdepth_core.training.batch import RigBatch
 from cvcdepth_core.training.config import AugmentationConfig, OptimizerConfig, TrainingConfig
 from cvcdepth_core.training.distributed import SINGLE_PROCESS, Processes, share_batch_statistics
@@ -360,6 +360,8 @@ class Trainer:
         config, batch, processes = self.config, part.batch, self._processes
         places = range(processes.rank, processes.count * len(batch.frames), processes.count)
         generators = [_generator(config.seed, self.progress.step, part.first + sample) for sample in places]
+        if not part.kind:
+            batch = zoom_in(batch, config.augmentation.zoom, generators)
         seen, depth_flips, pose_flips = _augment(batch, config.augmentation, generators)
         with torch.autocast(self._device.type, torch.bfloat16, self.autocast == "bfloat16"):
             prediction = self.model(batch, seen, depth_flips, pose_flips)
