@@ -29,8 +29,8 @@ class General:
     config: TrainingConfig
 
     def scores(self, device: torch.device, most: int | None = None) -> ViewScores | None:
-        """Return what scores the held-out views, at most `most` of them; None where none is held out."""
-        return ViewScores(self.held_out, self.config, device, most) if self.held_out.views else None
+        """Return what scores the held-out views, at most `most` of them; None where fewer than two are held out."""
+        return ViewScores(self.held_out, self.config, device, most) if len(self.held_out.views) > 1 else None
 
     @property
     def identity(self) -> str:
