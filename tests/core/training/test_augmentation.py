@@ -108,5 +108,5 @@ def test_a_window_shows_with_its_calibration_what_the_picture_showed_in_that_dir
 
 
 def test_a_zoom_of_one_changes_nothing():
-    batch = random_batch(1, 2, 32, 48)
+    batch = random_batch(1, 3, 32, 48)
     assert zoom_in(batch, 1.0, [generator()]) is batch
