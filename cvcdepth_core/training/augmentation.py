@@ -125,8 +125,8 @@ def zoom_in(batch: RigBatch, zoom: float, generators: Sequence[torch.Generator])
     zoomed.intrinsics[..., :2, :2] /= share[..., None, None]
     zoomed.intrinsics[..., :2, 2] = (batch.intrinsics[..., :2, 2] + 0.5 - corner) / share[..., None] - 0.5
     grid = _window_grid(share, corner, height, width)
-    frames = batch.frames.transpose(1, 2).flatten(2, 3)
-    zoomed.frames = _sampled(frames, grid, "bilinear").unflatten(2, batch.frames.shape[1:4:2]).transpose(1, 2)
+    by_camera = batch.frames.transpose(1, 2)
+    zoomed.frames = _sampled(by_camera.flatten(2, 3), grid, "bilinear").view(by_camera.shape).transpose(1, 2)
     zoomed.masks = _sampled(batch.masks, grid, "nearest")
     zoomed.truth = None if batch.truth is None else _sampled(batch.truth, grid, "nearest")
     return zoomed
@@ -144,7 +144,7 @@ def _window_grid(share: Tensor, corner: Tensor, height: int, width: int) -> Tens
 def _sampled(images: Tensor, grid: Tensor, mode: str) -> Tensor:
     """Sample images [B, N, C, H, W] at a grid [B, N, H, W, 2]."""
     found = F.grid_sample(images.flatten(0, 1), grid.flatten(0, 1).to(images), mode, "border", align_corners=False)
-    return found.unflatten(0, images.shape[:2])
+    return found.view(images.shape)
 
 
 def draw_flips(generators: Sequence[torch.Generator]) -> Tensor:

@@ -95,8 +95,8 @@ class Prediction:
 
     def first_sample(self) -> Prediction:
         """Return the output for the first sample, without its gradient."""
-        parts = (self.disparity, self.depth, self.motions, self.sky)
-        return Prediction(*(None if part is None else part[:1].detach() for part in parts))
+        disparity, depth, motions = (part[:1].detach() for part in (self.disparity, self.depth, self.motions))
+        return Prediction(disparity, depth, motions, None if self.sky is None else self.sky[:1].detach())
 
 
 @dataclass(frozen=True)

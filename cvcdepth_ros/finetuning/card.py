@@ -113,8 +113,10 @@ def _scores(result: EvaluationResult | None) -> dict[str, Any] | None:
 def _worlds(result: FinetuneResult) -> dict[str, Any] | None:
     if result.general is None:
         return None
-    scores = None if result.on_worlds is None else nan_to_null(result.on_worlds.to_json())
-    return {**result.general.to_json(), "scores": scores}
+    found = None if result.on_worlds is None else result.on_worlds.to_json()
+    if found is not None:
+        found |= {part: nan_to_null(found[part]) for part in ("before", "after", "difference")}
+    return {**result.general.to_json(), "scores": found}
 
 
 def _recording(result: FinetuneResult, number: int) -> dict[str, Any]:

@@ -11,6 +11,8 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from torch import Tensor
 from torch.utils.data import DataLoader
 
 from cvcdepth_core.errors import RecordingError, RigError
@@ -190,7 +192,18 @@ def _collate(
     read = [item for item in items if item is not None]
     if not read:
         return None
-    recordings, *columns = zip(*read, strict=True)
+    recordings, pictures, poses, delays, times, recorded_poses, truth = zip(*read, strict=True)
     rig: NetworkRig = rigs[recordings[0]]
-    known = [None if column[0] is None else torch.from_numpy(np.stack(column)) for column in columns]
-    return rig.batch(*known, truth_is_sparse=sources[recordings[0]] == "lidar")
+    return rig.batch(
+        _stacked(pictures),
+        _stacked(poses),
+        _stacked(delays),
+        _stacked(times),
+        None if recorded_poses[0] is None else _stacked(recorded_poses),
+        None if truth[0] is None else _stacked(truth),
+        truth_is_sparse=sources[recordings[0]] == "lidar",
+    )
+
+
+def _stacked(column: Sequence[NDArray[Any]]) -> Tensor:
+    return torch.from_numpy(np.stack(column))

@@ -73,12 +73,14 @@ def test_both_are_scored_and_told_in_log_result_and_card(run: Path):
     validations = entries(run, "validation")
     assert all({"score", "worlds_abs_rel", "worlds_delta_1"} <= set(entry["validation"]) for entry in validations)
     worlds = json.loads((run / "finetune.json").read_text())["worlds"]
-    assert (worlds["training_views"], worlds["held_out_views"], worlds["views_per_step"]) == (2, 2, 2)
+    assert (worlds["training_views"], worlds["held_out_views"], worlds["views_per_step"]) == (4, 4, 2)
     assert (worlds["share"], worlds["weight"]) == (0.25, 1.0)
     scores = worlds["scores"]
-    first, last = (entry["validation"]["worlds_abs_rel"] for entry in (validations[0], validations[-1]))
-    assert scores["before"]["abs_rel"] == first
-    assert scores["after"]["abs_rel"] == last
+    assert scores["views"] == 4
+    change = scores["after"]["abs_rel"] - scores["before"]["abs_rel"]
+    assert scores["difference"]["difference"] == pytest.approx(change, abs=1e-4)
+    assert change != 0
+    assert not scores["is_worse"]  # four views prove nothing
     assert "on worlds: Abs Rel" in scores["verdict"]
     text = (run / "model_card.md").read_text()
     assert "## Worlds" in text
@@ -101,7 +103,7 @@ def test_a_share_of_nothing_scores_worlds_and_learns_from_none(shards: Path, tmp
     assert finetune(config, tmp_path / "run", "--worlds", shards, "--keep-general", 0) == 0
     worlds = json.loads((tmp_path / "run" / "finetune.json").read_text())["worlds"]
     assert (worlds["views_per_step"], worlds["share"]) == (0, 0.0)
-    assert worlds["scores"]["views"] == 2
+    assert worlds["scores"]["views"] == 4
     assert not any(name.startswith("worlds_") for name in entries(tmp_path / "run", "loss")[0]["terms"])
 
 
