@@ -20,6 +20,7 @@ from cvcdepth_core.training.model import PoseMethod
 from cvcdepth_core.training.objective import ObjectiveConfig
 
 ExposureMotion = Literal["auto", "recorded", "network", "none"]
+Supervision = Literal["none", "lidar", "depth"]
 MotionSource = Literal["auto", "recorded", "network"]
 
 _BASE_KEY = "base"
@@ -39,12 +40,15 @@ class PoseConfig(_Section):
 
 
 class AugmentationConfig(_Section):
-    """Changes to the images that the networks see; the losses compare the unchanged ones."""
+    """Changes to samples; but for `zoom`, the losses compare the unchanged pictures."""
 
     color_jitter: ColorJitterConfig = ColorJitterConfig()
     """Random colour changes, per camera."""
     flip: FlipMode = "both"
     """Hflip-S: which networks see half of the samples mirrored."""
+    zoom: float = Field(default=1.0, ge=1, le=4)
+    """Of recordings: a random window of each camera's pictures takes their place, down to one of this many parts of
+    their width, with its own calibration, so that there are other lenses to learn from; 1 takes whole pictures."""
 
 
 class RecordingsConfig(_Section):
@@ -76,6 +80,10 @@ class RecordingsConfig(_Section):
     `recorded` (odometry or /tf), `network` (as the pose network says, at constant velocity between two sets), `auto`
     (recorded where there is some, else of the network), or `none`, as in the published method, which takes the
     exposures as simultaneous. `true` is `auto`, `false` is `none`."""
+    supervise: Supervision = "none"
+    """Whether depth is learnt from recorded truth too, beside the pictures: `lidar` (the sweep nearest to each picture,
+    moved by the recorded motion, without the points that a camera cannot see; of recordings that have one), or `depth`
+    (true depth images, as `simulate` records them)."""
     tolerance: float = Field(default=0.1, gt=0, le=10)
     """Seconds that two images of one set may be apart."""
     workers: int = Field(default=0, ge=0)
@@ -102,6 +110,11 @@ class WorldsConfig(_Section):
     """Share of the camera's height, standard deviation, by which the network is told it wrongly."""
     held_out: float = Field(default=0.03, ge=0, lt=1)
     """The last share of the drives, which is scored and never trained on."""
+    share: float = Field(default=0.5, ge=0, lt=1)
+    """Of `finetune --worlds`: which share of the pictures whose depth is learnt comes from worlds, in every step; 0
+    scores the worlds and learns from none. `--keep-general` takes its place."""
+    weight: float = Field(default=1.0, gt=0)
+    """Of `finetune --worlds`: by how much more a picture of a world counts in a step than one of a recording."""
 
 
 class OptimizerConfig(_Section):
@@ -174,7 +187,7 @@ class TrainingConfig(_Section):
     objective: ObjectiveConfig = ObjectiveConfig()
     """Weights and variants of the loss."""
     augmentation: AugmentationConfig = AugmentationConfig()
-    """Changes to the images that the networks see; the losses compare the unchanged ones."""
+    """Changes to samples."""
     recordings: RecordingsConfig = RecordingsConfig()
     """For `dataset: recording`: which moments become samples, and how they are read."""
     worlds: WorldsConfig = WorldsConfig()
