@@ -7,8 +7,9 @@ Each engine has a process of its own, whose peak memory it is, and they take tur
 6 x 384 x 640 as torch runs it: all cameras as one batch, operation by operation, float32. `times_eager` compares with
 the same for the same network and size. The engines run in processes set up like those of node and bag tool, which keep
 freed buffers (`prepare_process`); "buffers kept" is the baseline in such a process. Weights are random: they change
-nothing about the speed. A network is named by the encoder of the published one, or `rig_conditioned`. `gflop_per_cpu_s` is the work of the network as it was trained over the CPU time of all
-threads, `of_matrix_product` its ratio to what a thread reaches with large matrices, the limit of a core.
+nothing about the speed. A network is named by the encoder of the published one, or `rig_conditioned`. `gflop_per_cpu_s`
+is the work of the network as it was trained over the CPU time of all threads, `of_matrix_product` its ratio to what a
+thread reaches with large matrices, the limit of a core.
 """
 
 from __future__ import annotations

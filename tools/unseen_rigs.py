@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """What to expect of a checkpoint on a rig that it has not seen: the tables of docs/default_model.md.
 
-    python tools/unseen_rigs.py model.safetensors --worlds heldout/* --street pandaset_002 --rig rig.yaml --start 3 -o OUT
+    python tools/unseen_rigs.py model.safetensors --worlds heldout/* --street pandaset_002 --rig rig.yaml --start 3 -o o
 
 Simulated drives (`simulate --truth all`) are scored by their depth, the street by its LiDAR: as they are; the street
 shown by other rigs (views of the same pictures, with calibration and poses that fit them); and with a network that is
-told its rig wrongly, or sees other weather, while truth stays where it is. One process and one thread; `OUT/rows.jsonl`
+told its rig wrongly, or sees other weather, while truth stays where it is. One process and one thread; `rows.jsonl`
 keeps what is done, so that the same command goes on where it was killed.
 """
 
@@ -272,14 +272,14 @@ def seen(change_one: Callable[[NDArray[np.float32], np.random.Generator], NDArra
 
 
 def night(picture: NDArray[np.float32], random: np.random.Generator) -> NDArray[np.float32]:
-    """A twelfth of the light, bluish, with the noise of a sensor that amplifies it again by three."""
+    """Leave a twelfth of the light, bluish, with the noise of a sensor that amplifies it again by three."""
     light = picture**2.2 / 12 * np.array([0.8, 0.9, 1.2], np.float32)
     noisy = light + random.normal(0, 0.004, picture.shape).astype(np.float32)
     return np.asarray(np.clip(3 * noisy, 0, 1) ** (1 / 2.2), dtype=np.float32)
 
 
 def rain(picture: NDArray[np.float32], random: np.random.Generator) -> NDArray[np.float32]:
-    """A grey veil, streaks, and thirty drops on the lens behind which all is blurred."""
+    """Draw a grey veil, streaks, and thirty drops on the lens behind which all is blurred."""
     height, width = picture.shape[:2]
     streaks = (random.random((height, width)) > 0.997).astype(np.float32)
     veiled = 0.75 * picture + 0.15 + 0.8 * cv2.blur(streaks, (1, 9))[..., None]

@@ -98,6 +98,7 @@ def _exported(
 ) -> bytes:
     """Export for inputs of the examples' sizes, but for `axes`, which may have any; those of a name have the same."""
     content = io.BytesIO()
+    dynamic: dict[str, Any] = dict.fromkeys((*inputs, *outputs), axes)
     # The newer exporter needs two more packages and gives the same graph; torch before 2.5 does not know the word.
     older = {"dynamo": False} if "dynamo" in inspect.signature(torch.onnx.export).parameters else {}
     with warnings.catch_warnings():
@@ -109,7 +110,7 @@ def _exported(
             opset_version=_OPSET,
             input_names=list(inputs),
             output_names=list(outputs),
-            dynamic_axes=dict.fromkeys((*inputs, *outputs), axes),
+            dynamic_axes=dynamic,
             **older,  # type: ignore[arg-type]
         )
     return content.getvalue()
