@@ -207,8 +207,9 @@ def load_training_config(path: str | Path, start: DepthModelSpec | None = None) 
     """Read a training configuration; `base: FILE` names a file, relative to this one, that it builds on.
 
     What it does not say of the network is as in `start`, what the weights that training begins with are for; a file
-    without a word of it, and without a start, means the network of the package's own model. Raises ConfigError naming the file, the field, the
-    value found and what is allowed.
+    without a word of it, and without a start, means the network of the package's own model.
+
+    Raises ConfigError naming the file, the field, the value found and what is allowed.
     """
     path = Path(path)
     try:
