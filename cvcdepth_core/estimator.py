@@ -134,6 +134,11 @@ class DepthEstimator:
         )
 
 
+def is_told_its_rig(predictor: DepthPredictor) -> bool:
+    """Say whether its depth depends on where the rig's cameras are and look, and how high above the ground."""
+    return isinstance(predictor, DepthEstimator) and predictor.spec.is_told_its_rig
+
+
 def untrained_network(spec: DepthModelSpec, seed: int = 0) -> DepthNetwork:
     """Return a depth network whose weights are random and always the same."""
     with torch.random.fork_rng(devices=[]):
@@ -152,7 +157,7 @@ class SurroundDepthEstimator:
 
         RigError names the camera where the network is told the rig, and the rig cannot be right about the ground.
         """
-        if isinstance(estimator, DepthEstimator) and estimator.spec.is_told_its_rig:
+        if is_told_its_rig(estimator):
             refuse_unlikely_ground(rig)
         self.rig = rig
         self.estimator = estimator

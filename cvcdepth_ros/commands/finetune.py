@@ -131,6 +131,7 @@ def _job(arguments: argparse.Namespace, config: "TrainingConfig") -> "FinetuneJo
         lidar_topics(arguments),
         arguments.base_frame,
         config.recordings.motion,
+        config.depth.is_told_its_rig,
     )
     start = None if arguments.start is None else load_checkpoint(checkpoint_path(arguments.start))
     with_promotion = not arguments.no_promotion

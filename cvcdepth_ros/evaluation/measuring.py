@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from cvcdepth_core.errors import RecordingError
-from cvcdepth_core.estimator import DepthPredictor
+from cvcdepth_core.estimator import DepthPredictor, is_told_its_rig
 from cvcdepth_core.rendering.agreement import PosedDepth
 from cvcdepth_core.rig.poses import Pose
 from cvcdepth_core.rig.view import PicturePart
@@ -33,6 +33,7 @@ from cvcdepth_ros.evaluation.job import EvaluationJob
 from cvcdepth_ros.evaluation.pose_scores import PoseScoring
 from cvcdepth_ros.evaluation.references import ReferenceScores, ReferenceScoring
 from cvcdepth_ros.messages.cloud_sources import describe_left_out_clouds
+from cvcdepth_ros.recordings.ground import with_ground
 from cvcdepth_ros.recordings.replay import DepthReplay, RecordedImage, SurroundReplay
 from cvcdepth_ros.recordings.rig import RecordedRig
 from cvcdepth_ros.recordings.true_depth import RecordedDepthImages
@@ -172,6 +173,7 @@ class RecordingEvaluation:
     def __init__(self, job: EvaluationJob, recorded: RecordedRig, predictor: DepthPredictor | None = None) -> None:
         """`predictor` is the job's where it is loaded already; without it, it is loaded here."""
         self.job = job
+        recorded, self.ground = with_ground(recorded, job.lidar, job.settings.ground_height)
         self.replay = SurroundReplay(recorded, job.settings)
         self.truth = _truth(job, recorded)
         self.depths = DepthReplay(
@@ -381,6 +383,7 @@ def _summary(evaluation: RecordingEvaluation, scoring: _Scoring) -> dict[str, An
         "pose_network": scoring.poses.result(),
         "why_no_pose_network": scoring.poses.problem or None,
         "sky": {"pixels": int(scoring.sky[0]), "far": int(scoring.sky[1])},
+        "ground": {**evaluation.ground.to_json(), "told_to_network": is_told_its_rig(depths.estimator)},
         "no_flat_ground": scoring.references.problem or None,
         "refused": depths.refused.reasons + replay.unreadable.reasons,
         "truth_refused": {"count": truth.refused.count, "reasons": truth.refused.reasons[:10]},
