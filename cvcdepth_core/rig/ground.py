@@ -25,8 +25,8 @@ def unstated_ground(base_frame: str, why_not_found: str = "") -> str:
     """Return one line that tells that nobody says where the ground is, with the remedy."""
     reason = f" and was not found ({why_not_found})" if why_not_found else ""
     return (
-        f"the height of the ground in {base_frame} is not stated{reason}: taken for 0 m, and depth is as wrong as that; "
-        "`cvcdepth rig BAG` looks for it in a recording, or state it in the rig file: ground_height: -0.4"
+        f"the height of the ground in {base_frame} is not stated{reason}: taken for 0 m, and depth is as wrong as that "
+        "is; `cvcdepth rig BAG` looks for it in a recording, or state it in the rig file: ground_height: -0.4"
     )
 
 

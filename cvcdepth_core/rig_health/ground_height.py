@@ -23,12 +23,12 @@ Floats = NDArray[np.float64]
 MAX_SPREAD = 0.15
 """Metres by which the ground of half of the sweeps may differ from that of all."""
 
-_AHEAD, _ASIDE = 15.0, 2.5  # metres from the middle of the cameras: the lane
+_AHEAD, _ASIDE = 15.0, 1.8  # metres from the middle of the cameras: the lane
 _NEAR = 3.0  # metres: points count the same up to there, then less and less
 _CELL, _PER_CELL = 0.5, 4  # metres; points of a cell that are taken: sweeps are dense near the vehicle only
 _STEEPEST = math.tan(math.radians(6.0))
-_THICK = 0.05  # metres from the plane within which points are the ground's
-_BELOW = 0.1  # metres below the plane beyond which points deny it
+_THICK = 0.04  # metres from the plane within which points are the ground's
+_BELOW = 0.08  # metres below the plane beyond which points deny it
 _DRAWS = 400
 _REFITS = 6
 _USUAL_SLOPE, _POINT_NOISE = 0.05, 0.02  # of roads against vehicles, and metres: what a one-sided view does not tell

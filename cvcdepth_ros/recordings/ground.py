@@ -65,7 +65,6 @@ class RecordedGround:
             "told": self.told,
         }
 
-
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> RecordedGround:
         """Undo `to_json`; KeyError or TypeError where the content is another."""
@@ -113,9 +112,7 @@ def estimated_ground(recorded: RecordedRig, lidar: Sequence[str] | None = None) 
     return ground_by_lidar(recorded.recording, recorded.assembler().rig(), topics, recorded.transforms)
 
 
-def ground_by_lidar(
-    recording: Recording, rig: Rig, topics: Sequence[str], transforms: TransformTree
-) -> GroundEstimate:
+def ground_by_lidar(recording: Recording, rig: Rig, topics: Sequence[str], transforms: TransformTree) -> GroundEstimate:
     """Return the ground that some sweeps of these LiDARs show; RigError says why they do not."""
     recorded = [topic for topic in topics if topic in cloud_topics(recording)]
     if not recorded:

@@ -18,8 +18,8 @@ from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.recordings.ground import RecordedGround, recorded_ground, with_ground
 from cvcdepth_ros.recordings.rig import RecordedRig
 
-AXLES = -0.42
-"""Metres of the road in the sample's base frame, which is at the axles of its car."""
+AXLES = -0.31
+"""Metres of the lane under the car in the sample's base frame, which is at its axles; the street falls to the left."""
 
 
 def ground_of(path: Path, lidar: tuple[str, ...] | None = None, height: float | None = None) -> RecordedGround:
@@ -62,7 +62,8 @@ def test_a_cloud_that_cannot_be_placed_is_no_ground_and_says_why(tmp_path: Path)
         message.header.frame_id = "nowhere"
 
     topic = next(entry.topic for entry in recordings.sample_entries(1) if "PointCloud2" in entry.type)
-    copy = recordings.write_mcap(tmp_path / "lost.mcap", recordings.changed(recordings.sample_entries(2), topic, renamed))
+    entries = recordings.changed(recordings.sample_entries(2), topic, renamed)
+    copy = recordings.write_mcap(tmp_path / "lost.mcap", entries)
     ground = ground_of(copy)
     assert ground.is_assumed
     assert "nowhere" in ground.why_not
