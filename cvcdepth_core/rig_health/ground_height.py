@@ -48,9 +48,9 @@ class GroundEstimate:
     """Metres in the base frame, in the middle of the cameras."""
     uncertainty: float
     """Standard deviation of `height`, metres."""
-    rise_ahead: float
-    """Degrees by which the ground rises ahead against the base frame's x axis."""
-    rise_left: float
+    rise_ahead: float | None
+    """Degrees by which the ground rises ahead against the base frame's x axis; None where that is not known."""
+    rise_left: float | None
     """The same to the left."""
     source: Literal["lidar", "pictures"]
     """What it was found with."""

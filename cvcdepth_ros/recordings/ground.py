@@ -16,10 +16,12 @@ from cvcdepth_core.rig_health.ground_height import GroundEstimate, GroundFromSwe
 from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_ros.bags import Recording
 from cvcdepth_ros.messages.transforms import TransformTree
+from cvcdepth_ros.recordings.ground_pictures import ground_by_pictures
 from cvcdepth_ros.recordings.lidar import LidarSweep, read_sweep
 from cvcdepth_ros.recordings.refusals import Refusals
 from cvcdepth_ros.recordings.rig import RecordedRig
 from cvcdepth_ros.recordings.rig_messages import cloud_topics
+from cvcdepth_ros.settings import MatchingSettings
 
 _MOMENTS = 8  # spread over the recording
 _SWEEP_WITHIN_NS = NANOSECONDS  # of a moment
@@ -73,16 +75,18 @@ class RecordedGround:
         return cls(*told, estimate, content["why_not_found"] or "")
 
 
-def recorded_ground(recorded: RecordedRig, lidar: Sequence[str] | None = None) -> RecordedGround:
-    """Return where the ground is: as the layout states, else as LiDAR sweeps show it, else 0.
+def recorded_ground(
+    recorded: RecordedRig, lidar: Sequence[str] | None = None, *, with_pictures: bool = True
+) -> RecordedGround:
+    """Return where the ground is: as the layout states, else as LiDAR sweeps or else pictures show it, else 0.
 
-    `lidar` names the topics; None: `RecordedRig.lidars`.
+    `lidar` names the topics; None: `RecordedRig.lidars`. Pictures cost seconds, and are left out on request.
     """
     layout = recorded.layout
     if layout.ground_height is not None:
         return RecordedGround(layout.ground_height, "stated", layout.base_frame)
     try:
-        found = estimated_ground(recorded, lidar)
+        found = estimated_ground(recorded, lidar, with_pictures=with_pictures)
     except RigError as error:
         source: Literal["convention", "assumed"] = "convention" if is_on_ground(layout.base_frame) else "assumed"
         return RecordedGround(0.0, source, layout.base_frame, why_not=str(error))
@@ -90,7 +94,11 @@ def recorded_ground(recorded: RecordedRig, lidar: Sequence[str] | None = None) -
 
 
 def with_ground(
-    recorded: RecordedRig, lidar: Sequence[str] | None = None, height: float | None = None
+    recorded: RecordedRig,
+    lidar: Sequence[str] | None = None,
+    height: float | None = None,
+    *,
+    with_pictures: bool = True,
 ) -> tuple[RecordedRig, RecordedGround]:
     """Return the rig with the ground's height in its layout, where it is known, and where that is from.
 
@@ -98,7 +106,7 @@ def with_ground(
     """
     if height is not None:
         recorded = _at(recorded, height)
-    ground = recorded_ground(recorded, lidar)
+    ground = recorded_ground(recorded, lidar, with_pictures=with_pictures)
     return recorded if ground.estimate is None else _at(recorded, ground.height), ground
 
 
@@ -106,10 +114,21 @@ def _at(recorded: RecordedRig, height: float) -> RecordedRig:
     return recorded.with_layout(recorded.layout.model_copy(update={"ground_height": height}))
 
 
-def estimated_ground(recorded: RecordedRig, lidar: Sequence[str] | None = None) -> GroundEstimate:
+def estimated_ground(
+    recorded: RecordedRig, lidar: Sequence[str] | None = None, *, with_pictures: bool = True
+) -> GroundEstimate:
     """Return the ground as the recording shows it, whatever the layout states; RigError says why it does not."""
     topics = recorded.lidars if lidar is None else tuple(lidar)
-    return ground_by_lidar(recorded.recording, recorded.assembler().rig(), topics, recorded.transforms)
+    try:
+        return ground_by_lidar(recorded.recording, recorded.assembler().rig(), topics, recorded.transforms)
+    except RigError as error:
+        if not with_pictures:
+            raise
+        reason = error
+    try:
+        return ground_by_pictures(recorded, MatchingSettings())
+    except RigError as error:
+        raise RigError(f"{reason}; {error}") from error
 
 
 def ground_by_lidar(recording: Recording, rig: Rig, topics: Sequence[str], transforms: TransformTree) -> GroundEstimate:

@@ -123,4 +123,4 @@ def test_the_ground_of_a_simulated_street_is_where_its_base_frame_stands():
         sweeps.append(sweep.points @ mount[:3, :3].T + mount[:3, 3])
     ground = found(*sweeps, rig=drive.rig, sensor=mount[:3, 3])
     assert ground.height == pytest.approx(0.0, abs=0.02)
-    assert abs(ground.rise_ahead) < 0.3
+    assert ground.rise_ahead == pytest.approx(0.0, abs=0.3)

@@ -43,17 +43,33 @@ def test_what_is_stated_goes_before_what_is_found():
     assert ground.told == "ground at -0.30 m in base_link: as stated"
 
 
-def test_without_a_lidar_nothing_is_made_up_and_the_remedy_is_told():
+def test_without_a_lidar_the_pictures_show_the_road_nearly_as_well():
     ground = ground_of(SAMPLE, lidar=())
+    assert ground.source == "pictures"
+    assert ground.height == pytest.approx(AXLES, abs=0.1)  # a twentieth of the cameras' height
+    assert "m in base_link: from pictures, " in ground.told
+    assert ground.estimate is not None
+    assert abs(ground.height - AXLES) < 2 * ground.estimate.uncertainty
+
+
+def test_where_neither_shows_it_nothing_is_made_up_and_reasons_and_remedy_are_told(standing: Path):
+    ground = ground_of(standing, lidar=())
     assert (ground.height, ground.source) == (0.0, "assumed")
-    assert "not stated and was not found (no LiDAR" in ground.told
+    assert "not stated and was not found (no LiDAR; no recorded motion, which pictures of the road need)" in ground.told
     assert "ground_height: -0.4" in ground.told
 
 
-@pytest.mark.parametrize("lidar", [None, ()])
-def test_what_was_found_is_the_same_when_it_is_kept_and_read_again(lidar: tuple[str, ...] | None):
-    ground = ground_of(SAMPLE, lidar)
-    assert RecordedGround.from_json(json.loads(json.dumps(ground.to_json()))) == ground
+@pytest.fixture(scope="module")
+def standing(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two sets without motion and LiDAR."""
+    path = tmp_path_factory.mktemp("standing") / "standing.mcap"
+    entries = recordings.without(recordings.sample_entries(2), "/odom", "/lidar")
+    return recordings.write_mcap(path, (entry for entry in entries if entry.topic != "/tf"))
+
+
+def test_what_was_found_is_the_same_when_it_is_kept_and_read_again(standing: Path):
+    for ground in (ground_of(SAMPLE), ground_of(SAMPLE, height=-0.3), ground_of(standing)):
+        assert RecordedGround.from_json(json.loads(json.dumps(ground.to_json()))) == ground
 
 
 def test_a_cloud_that_cannot_be_placed_is_no_ground_and_says_why(tmp_path: Path):
@@ -120,10 +136,10 @@ def test_evaluate_and_run_look_for_the_ground_where_the_network_is_told_its_rig(
 
 
 def test_a_network_that_is_told_its_rig_warns_once_where_the_ground_is_not_known(
-    told_its_rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    told_its_rig: Path, standing: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    network = ("--checkpoint", str(told_its_rig), "--duration", "0.25", "--quiet", "--no-lidar", "--no-report")
-    assert main(["evaluate", str(SAMPLE), "-o", str(tmp_path / "out"), *network]) == 0
+    network = ("--checkpoint", str(told_its_rig), "--quiet", "--no-report")
+    assert main(["evaluate", str(standing), "-o", str(tmp_path / "out"), *network]) == 0
     warnings = [line for line in capsys.readouterr().err.splitlines() if "height of the ground" in line]
     assert len(warnings) == 1
     assert "cvcdepth rig BAG" in warnings[0]
@@ -142,16 +158,19 @@ def test_check_compares_what_is_stated_with_what_is_found_and_names_the_remedy(
 ):
     assert check_of(capsys, "--rig", str(rig_file))["status"] == "passed"
     unstated = check_of(capsys)
-    assert unstated["status"] == "warning"
-    assert "is stated, so it is taken for 0; at -0.3" in str(unstated["finding"])
-    assert "too near" in str(unstated["finding"])
+    assert unstated["status"] == "passed"
+    assert "no height of the ground in base_link is stated; found at -0.3" in str(unstated["finding"])
     assert "cvcdepth rig BAG" in str(unstated["remedy"])
-    wrong = tmp_path / "wrong.yaml"
-    wrong.write_text(rig_file.read_text().replace("ground_height:", "ground_height: -0.9 #"))
-    assert "too far" in str(check_of(capsys, "--rig", str(wrong))["finding"])
+    for height, words in ((0.0, "16% too near"), (-0.9, "too far")):
+        wrong = tmp_path / "wrong.yaml"
+        wrong.write_text(rig_file.read_text().replace("ground_height:", f"ground_height: {height} #"))
+        found = check_of(capsys, "--rig", str(wrong))
+        assert found["status"] == "warning"
+        assert words in str(found["finding"])
+        assert "ground_height: -0.30" in str(found["remedy"])
     skipped = check_of(capsys, "--no-lidar")
     assert skipped["status"] == "skipped"
-    assert "ground_height" in str(skipped["remedy"])
+    assert "ground_height: -0.4" in str(skipped["remedy"])
 
 
 def test_flat_ground_is_scored_at_the_height_that_was_found(tmp_path: Path):
