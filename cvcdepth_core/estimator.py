@@ -172,6 +172,11 @@ class _Predicted(NamedTuple):
         return PredictedDepth(self.depth[:, 0].numpy(), sky, log_uncertainty)
 
 
+def is_told_its_rig(predictor: DepthPredictor) -> bool:
+    """Say whether its depth depends on where the rig's cameras are and look, and how high above the ground."""
+    return isinstance(predictor, DepthEstimator) and predictor.spec.is_told_its_rig
+
+
 def untrained_network(spec: DepthModelSpec, seed: int = 0) -> DepthNetwork:
     """Return a depth network whose weights are random and always the same."""
     with torch.random.fork_rng(devices=[]):
@@ -190,7 +195,7 @@ class SurroundDepthEstimator:
 
         RigError names the camera where the network is told the rig, and the rig cannot be right about the ground.
         """
-        if isinstance(estimator, DepthEstimator) and estimator.spec.is_told_its_rig:
+        if is_told_its_rig(estimator):
             refuse_unlikely_ground(rig)
         self.rig = rig
         self.estimator = estimator

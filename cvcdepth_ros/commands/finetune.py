@@ -157,6 +157,7 @@ def _job(arguments: argparse.Namespace, config: "TrainingConfig", start: "Checkp
         lidar_topics(arguments),
         arguments.base_frame,
         config.recordings.motion,
+        config.depth.is_told_its_rig,
     )
     with_promotion = not arguments.no_promotion
     shards = find_shards(arguments.worlds)
