@@ -39,6 +39,7 @@ from cvcdepth_ros.node.rig_transforms import RigTransforms
 from cvcdepth_ros.node.subscriptions import CameraInputs, StaticTransformInput
 from cvcdepth_ros.settings import NodeParameters
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
+from cvcdepth_ros.surround_sets.output_messages import OutputLimits
 from cvcdepth_ros.surround_sets.refinement import RefinementStage
 from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet
 from cvcdepth_ros.surround_sets.synchronizer import SurroundSynchronizer
@@ -276,7 +277,7 @@ class SurroundSession:
         frame_ids = {name: self._assembler.view_frame_id(name) or "" for name in published.rig.names}
         parameters = read_parameters(self._node)
         self._needs_confidence = parameters.needs_confidence
-        self._outputs.publish(published, frame_ids, parameters.cloud_limits)
+        self._outputs.publish(published, frame_ids, OutputLimits.of(parameters))
         newest = max(published.surround_set.times_ns.values())
         self._ages.record("age of newest image at publish (ROS time)", "", newest)
 
