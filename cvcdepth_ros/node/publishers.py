@@ -11,6 +11,7 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from cvcdepth_core.errors import ConfigError
+from cvcdepth_core.obstacles.ground import GroundPlane
 from cvcdepth_ros.messages.conversion import ros_message_class, ros_message_factory
 from cvcdepth_ros.node.qos import refusing_impossible_qos
 from cvcdepth_ros.settings import NodeParameters
@@ -51,6 +52,11 @@ class SurroundOutputs:
     def wants_confidence(self) -> bool:
         """Return whether any camera's confidence is subscribed."""
         return any(self._has_subscribers(f"{camera}/{CONFIDENCE}") for camera in self._cameras)
+
+    @property
+    def ground(self) -> GroundPlane | None:
+        """The ground of the last set whose obstacles were asked for; None before any."""
+        return self._messages.ground
 
     def publish(self, estimated: EstimatedSet[Any], frame_ids: Mapping[str, str], limits: OutputLimits) -> None:
         """Publish one set; see `SurroundMessages.of_set` for stamps and frames.

@@ -26,6 +26,7 @@ from cvcdepth_ros.messages.conversion import stamp_ns
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
 from cvcdepth_ros.node.diagnostics import (
     camera_status,
+    ground_status,
     inference_status,
     model_status,
     overlap_status,
@@ -222,6 +223,7 @@ class SurroundSession:
             ),
             model_status(self._estimator),
             *([overlap_status(self._overlaps)] if self._overlaps else []),
+            *([ground_status(self._outputs.ground)] if self._outputs.ground else []),
             *([refinement_status(self._refinement, self._motion.poses)] if self._refinement.is_active else []),
         ]
 

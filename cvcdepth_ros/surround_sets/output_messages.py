@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
+from cvcdepth_core.obstacles.ground import GroundPlane
 from cvcdepth_core.obstacles.scan import Scan, ScanLimits, scan_of
 from cvcdepth_core.obstacles.separation import ObstacleLimits, SeparatedCloud, separate
 from cvcdepth_core.pointcloud import Cloud, CloudLimits, banded, merged_cloud, organised_cloud, thinned
@@ -105,11 +106,6 @@ class MergedProducts:
         return separate(self._whole, self._rig.ground_height, self._limits.obstacles)
 
     @cached_property
-    def scan(self) -> Scan:
-        """The nearest obstacles all around."""
-        return scan_of(self.separated, self._limits.scan, self._limits.obstacles.max_range)
-
-    @cached_property
     def _whole(self) -> Cloud:
         return merged_cloud(self._result, self._rig, self._limits.cloud.whole)
 
@@ -129,6 +125,8 @@ class SurroundMessages:
         self._sky: SkyChoice = sky
         self._encoding = depth_encoding
         self._least = depth_min_confidence
+        self.ground: GroundPlane | None = None
+        """Where the ground was in the last set whose obstacles were asked for; None before any."""
 
     def of_set(
         self,
@@ -177,10 +175,17 @@ class SurroundMessages:
         return {
             MERGED_CLOUD: lambda: make.point_cloud(stamp, frame, merged.points),
             MERGED_CAMERAS: lambda: make.string(json.dumps(description)),
-            OBSTACLES: lambda: make.point_cloud(stamp, frame, merged.separated.obstacles),
-            GROUND: lambda: make.point_cloud(stamp, frame, merged.separated.ground),
-            SCAN: lambda: make.laser_scan(stamp, frame, merged.scan),
+            OBSTACLES: lambda: make.point_cloud(stamp, frame, self._separated(merged).obstacles),
+            GROUND: lambda: make.point_cloud(stamp, frame, self._separated(merged).ground),
+            SCAN: lambda: make.laser_scan(stamp, frame, self._scan(merged, limits)),
         }
+
+    def _separated(self, merged: MergedProducts) -> SeparatedCloud:
+        self.ground = merged.separated.plane
+        return merged.separated
+
+    def _scan(self, merged: MergedProducts, limits: OutputLimits) -> Scan:
+        return scan_of(self._separated(merged), limits.scan, limits.obstacles.max_range)
 
     def _camera_messages(
         self, result: SurroundDepth, index: int, stamp: int, frame_id: str, least: float

@@ -17,7 +17,7 @@ def ground(slope_x=0.0, slope_y=0.0, height=0.0, noise=0.03, reach=12.0, seed=0)
 def box(x, y, length=4.0, width=1.8, height=1.5, count=600, seed=1):
     rng = np.random.default_rng(seed)
     corner = rng.random((count, 3)) * (length, width, height)
-    return (corner + (x, y, 0.0)).astype(np.float32)
+    return (corner + np.array([x, y, 0.0])).astype(np.float32)
 
 
 def cars():

@@ -3,6 +3,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -40,7 +41,7 @@ def estimated() -> EstimatedSet:
     return EstimatedSet(surround_set, RIG, replace(surround, sky=sky))
 
 
-def built(estimated: EstimatedSet, *topics: str, limits: OutputLimits | None = None, **options):
+def built(estimated: EstimatedSet, *topics: str, limits: OutputLimits | None = None, **options: Any):
     messages = SurroundMessages(bag_message_factory(), options.pop("encoding", "32FC1"), **options)
     frames = {name: f"{name}_optical" for name in RIG.names}
     found = messages.of_set(estimated, frames, limits or OutputLimits(), topics.__contains__)
