@@ -65,5 +65,6 @@ def scan_of(cloud: SeparatedCloud, limits: ScanLimits, max_range: float) -> Scan
 
 def _beams_of(points: NDArray[np.float32], beams: int) -> NDArray[np.int64]:
     """Return the beam [M] of each point."""
-    share = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5
+    x, y = points[:, :2].T.astype(np.float64)
+    share = np.arctan2(y, x) / (2 * np.pi) + 0.5
     return np.clip((share * beams).astype(np.int64), 0, beams - 1)

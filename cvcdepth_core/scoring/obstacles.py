@@ -218,7 +218,7 @@ class ObstacleScorer:
         places = np.stack([np.cos(middles), np.sin(middles)], axis=1) * np.minimum(predicted, far)[:, None]
         invented = is_clear & seen.is_free(places)
         self._total.sectors[:] += (int(both.sum()), int(missed.sum()), int(invented.sum()))
-        self._errors.append((predicted - true)[both].astype(np.float32))
+        self._errors.append((predicted[both] - true[both]).astype(np.float32))
 
 
 @dataclass(frozen=True, eq=False)

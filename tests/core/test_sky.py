@@ -55,7 +55,7 @@ def test_pixels_look_up_above_the_horizon_whatever_the_mount():
         (np.full((HEIGHT, WIDTH, 3), 200, np.uint8), "a white lorry that fills the picture goes on below the horizon"),
         (street(sky=(120, 80, 50)), "a brown facade is redder than any sky"),
         (street(sky=(8, 9, 14)), "at night the sky is no brighter than the road"),
-        (street(horizon=2), "houses that fill the picture leave a line"),
+        (street(horizon=0), "houses fill the picture to its upper edge"),
     ],
 )
 def test_in_doubt_there_is_no_sky(picture, why):

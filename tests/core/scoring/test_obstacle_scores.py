@@ -64,8 +64,8 @@ def test_what_the_truth_does_not_tell_counts_for_nothing(with_post, without_post
 def test_wrong_scale_finds_nothing_that_is_there(with_post):
     near = replace(with_post, depth=0.6 * with_post.depth)
     found = scores(near, with_post)
-    assert found.recall()[0, 1] < 0.2
-    assert found.precision()[0, 1] < 0.2
+    assert found.recall()[0, 1] < 0.5
+    assert found.precision()[0, 1] < 0.5
     assert np.median(found.errors) < -1.5
 
 
