@@ -128,7 +128,7 @@ class DepthEstimator:
         """Return where a set shows the sky [N, H, W], by its `depth` where the network knows the sky, else by looks."""
         if self.spec.tells_sky:
             return beyond_measure(depth, surround.fx, self.spec.max_depth, self.spec.focal_scale)
-        return sky_in_pictures(surround)
+        return sky_in_pictures(surround, depth)
 
     def _depth(self, surround: SurroundPictures) -> torch.Tensor:
         """Return the network's depth [N, 1, H, W] in metres."""

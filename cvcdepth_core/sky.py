@@ -2,8 +2,9 @@
 """The sky: pixels that show nothing whose depth could be measured.
 
 A network that knows the sky puts it at its farthest depth. For one that does not, `sky_in_picture` looks for what is
-smooth from the picture's upper edge down to something above the horizon, at least as bright as what lies below, and no
-redder than grey. In doubt there is no sky: points that stay cost less than an obstacle that vanishes.
+smooth from the picture's upper edge down to something above the horizon, at least as bright as what lies below, no
+redder than grey, and not near by the network's own depth: a light wall looks like a clouded sky. In doubt there is no
+sky: points that stay cost less than an obstacle that vanishes.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ _LEAST_SHARE = 0.004  # of the picture: smaller patches are no sky
 _OUTLINE = 4  # pixels of the small picture around smooth sky in which its colour decides
 _LIKE_THE_SKY = 3.0  # standard deviations of the sky's colour
 _LEAST_DEVIATION = 6.0  # grey levels
+_NEAREST = 12.0  # metres that the network's depth of a sky has at least, in the middle of its pixels
 _WARMEST = 12.0  # grey levels by which the sky's red may exceed its blue
 
 
@@ -37,12 +39,13 @@ def beyond_measure(
     return beyond
 
 
-def sky_in_pictures(surround: SurroundPictures) -> NDArray[np.bool_]:
-    """Return where the pictures of a set show the sky [N, H, W], by their looks and mounts alone."""
+def sky_in_pictures(surround: SurroundPictures, depth: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Return where the pictures of a set show the sky [N, H, W], by looks, mounts, and `depth` [N, H, W] in metres."""
     sky = np.zeros(surround.valid.shape, dtype=np.bool_)
+    size = (sky.shape[1], sky.shape[2])
     for camera in np.flatnonzero(surround.present).tolist():
-        upward = elevations(surround.intrinsics[camera], surround.base_T_camera[camera], *sky.shape[1:])
-        sky[camera] = sky_in_picture(surround.pictures[camera], upward) & surround.valid[camera]
+        upward = elevations(surround.intrinsics[camera], surround.base_T_camera[camera], *size)
+        sky[camera] = sky_in_picture(surround.pictures[camera], upward, depth[camera]) & surround.valid[camera]
     return sky
 
 
@@ -62,11 +65,14 @@ def elevations(
     return sines.astype(np.float32)
 
 
-def sky_in_picture(picture: NDArray[np.uint8], upward: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Return where an RGB picture [H, W, 3] shows the sky; `upward` are its `elevations`."""
+def sky_in_picture(
+    picture: NDArray[np.uint8], upward: NDArray[np.float32], depth: NDArray[np.float32]
+) -> NDArray[np.bool_]:
+    """Return where an RGB picture [H, W, 3] of that depth [H, W] shows the sky; `upward` are its `elevations`."""
     height, width = upward.shape
     small = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
-    seed = _smooth_sky(small, upward)
+    metres = cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST)
+    seed = _smooth_sky(small, upward, metres)
     if not seed.any():
         return np.zeros(picture.shape[:2], dtype=np.bool_)
     near = cv2.dilate(seed.astype(np.uint8), np.ones((2 * _OUTLINE + 1, 2 * _OUTLINE + 1), np.uint8)) > 0
@@ -79,7 +85,9 @@ def _step(width: int) -> int:
     return max(width // _WIDTH, 1)
 
 
-def _smooth_sky(small: NDArray[np.float32], upward: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _smooth_sky(
+    small: NDArray[np.float32], upward: NDArray[np.float32], metres: NDArray[np.float32]
+) -> NDArray[np.bool_]:
     """Return the smooth regions that begin at the upper edge and end above the horizon, and look like a sky."""
     count, regions, boxes, _ = cv2.connectedComponentsWithStats(_smooth(small).astype(np.uint8), connectivity=4)
     below = np.bincount(regions[upward < _BELOW_HORIZON], minlength=count)
@@ -88,7 +96,7 @@ def _smooth_sky(small: NDArray[np.float32], upward: NDArray[np.float32]) -> NDAr
     sky = np.zeros(regions.shape, dtype=np.bool_)
     for region in np.flatnonzero(large[1:]) + 1:
         found = regions == region
-        if _looks_like_sky(small, found, upward):
+        if np.median(metres[found]) >= _NEAREST and _looks_like_sky(small, found, upward):
             sky |= found
     return sky
 
@@ -106,7 +114,7 @@ def _looks_like_sky(small: NDArray[np.float32], region: NDArray[np.bool_], upwar
     red, green, blue = np.median(small[region], axis=0).tolist()
     ground = small[upward < 0]
     darkest = float(np.median(ground)) if ground.size else 0.0
-    return blue - red > -_WARMEST and (red + green + blue) / 3 >= darkest
+    return bool(blue - red > -_WARMEST and (red + green + blue) / 3 >= darkest)
 
 
 def _is_like(small: NDArray[np.float32], seed: NDArray[np.bool_]) -> NDArray[np.bool_]:

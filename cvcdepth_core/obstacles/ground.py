@@ -89,7 +89,8 @@ def _near_ground(points: Points, ground_height: float, settings: GroundSettings)
     some = points[::step, :3].astype(np.float32)
     distance = np.hypot(some[:, 0], some[:, 1])
     lift = np.abs(some[:, 2] - np.float32(ground_height))
-    return some[(distance < settings.reach) & (lift < settings.uncertainty + settings.steepest * distance)]
+    near = (distance < settings.reach) & (lift < settings.uncertainty + settings.steepest * distance)
+    return np.asarray(some[near])
 
 
 def _low_cells(points: NDArray[np.float32], edge: float) -> NDArray[np.float64]:

@@ -67,4 +67,4 @@ def _beams_of(points: NDArray[np.float32], beams: int) -> NDArray[np.int64]:
     """Return the beam [M] of each point."""
     x, y = points[:, :2].T.astype(np.float64)
     share = np.arctan2(y, x) / (2 * np.pi) + 0.5
-    return np.clip((share * beams).astype(np.int64), 0, beams - 1)
+    return np.asarray(np.clip((share * beams).astype(np.int64), 0, beams - 1))

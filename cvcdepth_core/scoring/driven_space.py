@@ -42,7 +42,7 @@ class DrivenSpace:
 
     def counts(self) -> NDArray[np.int64]:
         """Return [R, 2] the later places within each range, and those of them where something was said to stand."""
-        return self._counts.copy()
+        return np.array(self._counts)
 
     def _compare(self, earlier: _Earlier, world_T_base: NDArray[np.float64]) -> None:
         now_T_then = np.linalg.inv(world_T_base) @ earlier.world_T_base

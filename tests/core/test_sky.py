@@ -11,6 +11,7 @@ HEIGHT, WIDTH = 192, 320
 INTRINSICS = np.array([[160.0, 0, 159.5], [0, 160.0, 95.5], [0, 0, 1]])
 LEVEL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.6], [0, 0, 0, 1]])
 """Looks along the base frame's x, 1.6 m above its origin."""
+FAR = np.full((HEIGHT, WIDTH), 30.0, np.float32)
 BLUE, GREY_ROAD, WALL = (150, 180, 220), (90, 90, 92), (140, 70, 60)
 
 
@@ -35,7 +36,7 @@ def test_depth_at_the_farthest_of_each_camera_is_sky():
 
 
 def test_the_smooth_bright_part_above_the_houses_is_sky():
-    found = sky_in_picture(street(), upward())
+    found = sky_in_picture(street(), upward(), FAR)
     assert found[:76].all()
     assert not found[88:].any()
 
@@ -59,7 +60,12 @@ def test_pixels_look_up_above_the_horizon_whatever_the_mount():
     ],
 )
 def test_in_doubt_there_is_no_sky(picture, why):
-    assert not sky_in_picture(picture, upward()).any(), why
+    assert not sky_in_picture(picture, upward(), FAR).any(), why
+
+
+def test_a_light_wall_that_the_network_sees_near_is_no_sky():
+    near = np.where(np.arange(HEIGHT)[:, None] < 100, np.float32(6.0), FAR)
+    assert not sky_in_picture(street(), upward(), near).any()
 
 
 def test_only_present_cameras_and_valid_pixels_have_sky():
@@ -72,7 +78,7 @@ def test_only_present_cameras_and_valid_pixels_have_sky():
         np.stack([LEVEL] * 2),
         valid,
     )
-    found = sky_in_pictures(surround)
+    found = sky_in_pictures(surround, np.stack([FAR] * 2))
     assert found[0, :70, 10:].all()
     assert not found[0, :, :10].any()
     assert not found[1].any()
