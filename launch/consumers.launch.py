@@ -13,7 +13,6 @@ from launch_ros.actions import Node
 
 from launch import LaunchContext, LaunchDescription
 
-_CAMERAS = "front front_left front_right back"
 _DEPTH, _DEPTH_INFO, _COLOUR, _COLOUR_INFO = "depth/image_rect", "depth/camera_info", "image_rect", "camera_info"
 _MOST_CAMERAS = 4
 
@@ -22,9 +21,11 @@ def generate_launch_description() -> LaunchDescription:
     """Declare the arguments."""
     return LaunchDescription(
         [
-            DeclareLaunchArgument("consumer", description=f"One of {', '.join(_CONSUMERS)}."),
+            DeclareLaunchArgument(
+                "consumer", default_value="octomap_server", description=f"One of {', '.join(_CONSUMERS)}."
+            ),
             DeclareLaunchArgument("depth_node", default_value="/surround_depth", description="Our node's name."),
-            DeclareLaunchArgument("cameras", default_value=_CAMERAS, description="nvblox, rtabmap: four at most."),
+            DeclareLaunchArgument("cameras", default_value="front front_left front_right back", description="nvblox, rtabmap: four at most."),
             DeclareLaunchArgument("params_file", default_value="", description="Its parameters, in place of ours."),
             OpaqueFunction(function=_start),
         ]
