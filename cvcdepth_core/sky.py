@@ -42,9 +42,9 @@ def beyond_measure(
 def sky_in_pictures(surround: SurroundPictures, depth: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Return where the pictures of a set show the sky [N, H, W], by looks, mounts, and `depth` [N, H, W] in metres."""
     sky = np.zeros(surround.valid.shape, dtype=np.bool_)
-    size = (sky.shape[1], sky.shape[2])
+    height, width = surround.valid[0].shape
     for camera in np.flatnonzero(surround.present).tolist():
-        upward = elevations(surround.intrinsics[camera], surround.base_T_camera[camera], *size)
+        upward = elevations(surround.intrinsics[camera], surround.base_T_camera[camera], height, width)
         sky[camera] = sky_in_picture(surround.pictures[camera], upward, depth[camera]) & surround.valid[camera]
     return sky
 

@@ -25,7 +25,11 @@ def generate_launch_description() -> LaunchDescription:
                 "consumer", default_value="octomap_server", description=f"One of {', '.join(_CONSUMERS)}."
             ),
             DeclareLaunchArgument("depth_node", default_value="/surround_depth", description="Our node's name."),
-            DeclareLaunchArgument("cameras", default_value="front front_left front_right back", description="nvblox, rtabmap: four at most."),
+            DeclareLaunchArgument(
+                "cameras",
+                default_value="front front_left front_right back",
+                description="nvblox, rtabmap: four at most.",
+            ),
             DeclareLaunchArgument("params_file", default_value="", description="Its parameters, in place of ours."),
             OpaqueFunction(function=_start),
         ]

@@ -39,7 +39,7 @@ _BEARINGS = 720  # of the rays along which truth tells free space
 _SECTORS = 72
 _MOST_TRUTH = 40000  # points of a camera
 _CLOUD = CloudLimits(stride=2, min_range=0.5, max_range=60.0)
-_COUNTS = ("truth", "found", "predicted", "right")
+_COUNTS = ("truth", "found", "predicted", "correct")
 
 
 class SectorCounts(NamedTuple):
@@ -58,7 +58,7 @@ class ObstacleScores:
     """Obstacles of one recording, or of several."""
 
     counts: NDArray[np.int64]
-    """[T, R, 4] by threshold and range: taken squares of the truth, those found, predicted squares, those right."""
+    """[T, R, 4] by threshold and range: taken squares of the truth, those found, predicted squares, those correct."""
     sectors: NDArray[np.int64]
     """[3] `SectorCounts`."""
     errors: NDArray[np.float32]
