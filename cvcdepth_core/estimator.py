@@ -19,6 +19,7 @@ from cvcdepth_core.networks.mirroring import fuse_with_mirrored, mirrored_pictur
 from cvcdepth_core.networks.registry import DepthModelSpec
 from cvcdepth_core.rig.ground import refuse_unlikely_ground
 from cvcdepth_core.rig.rig import Rig
+from cvcdepth_core.sky import beyond_measure, sky_in_pictures
 from cvcdepth_core.surround_depth import SurroundDepth, SurroundPictures
 
 
@@ -137,6 +138,12 @@ class DepthEstimator:
                 found = found.fused(self._predicted(mirrored_pictures(surround)), self.flip_fusion)
         return found.arrays()
 
+    def sky(self, surround: SurroundPictures, depth: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Return where a set shows the sky [N, H, W], by its `depth` where the network knows the sky, else by looks."""
+        if self.spec.tells_sky:
+            return beyond_measure(depth, surround.fx, self.spec.max_depth, self.spec.focal_scale)
+        return sky_in_pictures(surround, depth)
+
     def _predicted(self, surround: SurroundPictures) -> "_Predicted":
         outputs = self._engine.details(surround)
         depth = disparity_to_depth(
@@ -218,7 +225,8 @@ class SurroundDepthEstimator:
         if pictures.present.any():
             known = pictures.valid & pictures.present[:, None, None]
             np.copyto(depth, self.estimator.estimate(pictures), where=known)
-        return SurroundDepth(depth, pictures.pictures, pictures.intrinsics, pictures.present)
+        sky = self.estimator.sky(pictures, depth) if isinstance(self.estimator, DepthEstimator) else None
+        return SurroundDepth(depth, pictures.pictures, pictures.intrinsics, pictures.present, sky=sky)
 
     def _surround_pictures(self, rectified: Sequence[Picture | None]) -> SurroundPictures:
         pictures = np.zeros((*self.preprocessor.valid.shape, 3), dtype=np.uint8)
