@@ -9,11 +9,12 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from cvcdepth_core.engines.conditioning import KeptForRig, conditioning_of
+from cvcdepth_core.engines.conditioning import KeptForRig, KeptForWholeRig, conditioning_of
 from cvcdepth_core.engines.engine import best_chunk, image_by_image
 from cvcdepth_core.engines.rewriting import RewrittenDepthNet
 from cvcdepth_core.model_choices import Precision
 from cvcdepth_core.networks import ConditionedNetwork, DepthNet, DepthNetwork, RigImages
+from cvcdepth_core.networks.vfdepth import FusedDepthNet
 
 
 class TorchEagerEngine:
@@ -27,6 +28,7 @@ class TorchEagerEngine:
         self._told = (
             KeptForRig(conditioning_of(self._network)) if isinstance(self._network, ConditionedNetwork) else None
         )
+        self._geometry = KeptForWholeRig(self._network.geometry) if isinstance(self._network, FusedDepthNet) else None
 
     @torch.inference_mode()
     def disparity(self, rig: RigImages) -> Tensor:
@@ -34,6 +36,8 @@ class TorchEagerEngine:
         if isinstance(self._network, ConditionedNetwork) and self._told is not None:
             found = self._network.disparity(rig.images.flatten(0, 1), *self._told(rig))
             return found.view(*rig.images.shape[:2], *found.shape[1:])
+        if isinstance(self._network, FusedDepthNet) and self._geometry is not None:
+            return self._network.disparity(rig.images, self._geometry(rig))
         disparity: Tensor = self._network(rig)
         return disparity
 

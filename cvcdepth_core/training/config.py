@@ -17,6 +17,7 @@ from cvcdepth_core.networks.pose import MAX_TRANSLATION
 from cvcdepth_core.networks.registry import DepthModelSpec
 from cvcdepth_core.training.augmentation import ColorJitterConfig, FlipMode
 from cvcdepth_core.training.model import PoseMethod
+from cvcdepth_core.training.novel_views import NovelViewsConfig
 from cvcdepth_core.training.objective import ObjectiveConfig
 
 ExposureMotion = Literal["auto", "recorded", "network", "none"]
@@ -175,6 +176,8 @@ class TrainingConfig(_Section):
     """Weights and variants of the loss."""
     augmentation: AugmentationConfig = AugmentationConfig()
     """Changes to the images that the networks see; the losses compare the unchanged ones."""
+    synthesis: NovelViewsConfig = NovelViewsConfig()
+    """For the objective's `synthesis_...` terms: how far the cameras are turned."""
     recordings: RecordingsConfig = RecordingsConfig()
     """For `dataset: recording`: which moments become samples, and how they are read."""
     worlds: WorldsConfig = WorldsConfig()
@@ -198,6 +201,17 @@ class TrainingConfig(_Section):
             raise ValueError(
                 f"objective.pose_consistency is {self.objective.pose_consistency}, which compares the cameras' own "
                 f"motions, but pose.method is {self.pose.method!r}, expected 'per_camera'"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _synthesis_has_a_volume(self) -> TrainingConfig:
+        loss, volume = self.objective, self.depth.volume
+        if loss.synthesises and (volume is None or volume.skips):
+            raise ValueError(
+                f"objective.synthesis_consistency is {loss.synthesis_consistency:g} and synthesis_smoothness "
+                f"{loss.synthesis_smoothness:g}, but depth.network is {self.depth.network}, "
+                + ("expected vfdepth" if volume is None else "whose skips show a turned camera another one's picture")
             )
         return self
 
