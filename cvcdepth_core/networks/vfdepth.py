@@ -100,7 +100,8 @@ class FusedDepthNet(DepthNetwork):
 
 def _repeated(features: Tensor, samples: int, copies: int) -> Tensor:
     """Return features [B N, ...] of each camera for each copy of the rig, [B copies N, ...]."""
-    return features.unflatten(0, (samples, 1, -1)).expand(-1, copies, *[-1] * 4).flatten(0, 2)
+    each = features.view(samples, 1, -1, *features.shape[1:])
+    return each.expand(-1, copies, *each.shape[2:]).flatten(0, 2)
 
 
 class Aggregation(nn.Module):
@@ -155,7 +156,7 @@ class VolumeViews(nn.Module):
         """Return the views [B M, view_channels, h, w] of voxels [B V, Q]."""
         maps = _images_of(rays.sum_of(voxels), (size[0] + 2, size[1] + 2), self.steps)
         # A sample's channels lie together in memory; the checkpoint has the samples of a channel together.
-        weight = self.reduce.weight.unflatten(1, (-1, self.steps)).transpose(1, 2).flatten(1, 2)
+        weight = self.reduce.weight.reshape(_REDUCED, -1, self.steps, 3, 3).transpose(1, 2).flatten(1, 2)
         x = F.leaky_relu(F.conv2d(maps, weight, self.reduce.bias), _SLOPE)
         return F.leaky_relu(self.second(x), _SLOPE)
 

@@ -107,7 +107,7 @@ class WeightedRows(NamedTuple):
 
     def sum_of(self, table: Tensor) -> Tensor:
         """Return [M, C], the weighted sums of rows of `table` [R, C]."""
-        if torch.jit.is_tracing():  # ONNX has no such bags, but gathers
+        if torch.onnx.is_in_onnx_export():  # it has no such bags, but gathers
             total = torch.zeros_like(self.weights[:, :1])
             for row, weight in zip(self.rows.unbind(1), self.weights.unbind(1), strict=True):
                 total = total + weight[:, None] * table[row.long()]

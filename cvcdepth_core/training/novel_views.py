@@ -59,7 +59,8 @@ def draw_turns(config: NovelViewsConfig, cameras: int, generators: Sequence[torc
 def turns_of(config: NovelViewsConfig, drawn: Tensor) -> Tensor:
     """Return the axis-angles [..., 3] in radians of numbers [..., 3] in [0, 1)."""
     unit = 1.0 if config.radians else math.pi / 180
-    return (2 * drawn - 1) * drawn.new_tensor(config.max_turn) * unit
+    turns: Tensor = (2 * drawn - 1) * drawn.new_tensor(config.max_turn) * unit
+    return turns
 
 
 def novel_poses(base_T_camera: Tensor, turns: Tensor) -> Tensor:
@@ -112,4 +113,5 @@ def _depth_range(batch: RigBatch, novel: NovelViews, targets: Tensor, corrected:
 def smoothness_of_views(disparity: Tensor) -> Tensor:
     """Return the smoothness [...] of disparity [..., 1, H, W] relative to its mean; there is no picture with edges."""
     relative = disparity / (disparity.mean(dim=(-2, -1), keepdim=True) + _EPSILON)
-    return sum(relative.diff(dim=dim).abs().mean((-3, -2, -1)) for dim in (-1, -2))  # type: ignore[return-value]
+    along_x, along_y = (relative.diff(dim=dim).abs().mean((-3, -2, -1)) for dim in (-1, -2))
+    return along_x + along_y

@@ -102,7 +102,8 @@ class Prediction:
 
     def first_sample(self) -> Prediction:
         """Return the output for the first sample, without its gradient."""
-        return Prediction(*(part[:1].detach() for part in (self.disparity, self.depth, self.motions)))
+        disparity, depth, motions = (part[:1].detach() for part in (self.disparity, self.depth, self.motions))
+        return Prediction(disparity, depth, motions)
 
 
 @dataclass(frozen=True)

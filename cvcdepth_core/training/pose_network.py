@@ -78,9 +78,12 @@ class PoseAnswers:
 
 def _rig_of(images: Tensor, base_T_camera: NDArray[np.float64], intrinsics: NDArray[np.float64]) -> RigImages:
     """Return images [1, N, 3, H, W] with their cameras, all of whose pixels show the scene."""
-    calibration = (torch.from_numpy(part).float()[None] for part in (intrinsics, base_T_camera))
     return RigImages(
-        images, *calibration, torch.ones(images.shape[:2], dtype=torch.bool), torch.ones_like(images[:, :, :1])
+        images=images,
+        intrinsics=torch.from_numpy(intrinsics).float()[None],
+        base_T_camera=torch.from_numpy(base_T_camera).float()[None],
+        present=torch.ones(images.shape[:2], dtype=torch.bool),
+        masks=torch.ones_like(images[:, :, :1]),
     )
 
 

@@ -47,7 +47,7 @@ class NetworkRig:
     @property
     def poses_above_ground(self) -> NDArray[np.float64]:
         """`base_T_camera` [N, 4, 4] with the ground at z = 0."""
-        poses = self.base_T_camera.copy()
+        poses: NDArray[np.float64] = self.base_T_camera.copy()
         poses[:, 2, 3] -= self.ground_height
         return poses
 

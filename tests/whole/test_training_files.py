@@ -11,6 +11,7 @@ import torch
 from repository import ROOT
 from scenes import random_batch
 
+from cvcdepth_core.networks.checkpoint import load_checkpoint
 from cvcdepth_core.training.config import load_training_config
 from cvcdepth_core.training.novel_views import draw_turns
 from cvcdepth_core.training.objective import evaluate_objective
@@ -92,3 +93,19 @@ def test_the_documented_lines_give_a_file_with_which_finetune_trains(
     assert main([*arguments, "--no-masks", "--skip", "places", "--quiet", "--device", "cpu", "--no-promotion"]) == 0
     assert "nothing was proven: no recording has a held-out part" in capsys.readouterr().out
     assert Path("run/last.safetensors").exists()
+
+
+def test_the_file_of_a_network_that_fuses_its_cameras_trains_and_its_checkpoint_runs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    config = tmp_path / "here.yaml"
+    base = ROOT / "config" / "training" / "finetune_vfdepth.yaml"
+    config.write_text(f"base: {base}\n{small(base)}recordings: {{held_out: 0.0}}\n")
+    drives = recordings.write_rosbag2(tmp_path / "drives", recordings.sample_entries(4))
+    options = ["--no-masks", "--skip", "places", "--quiet", "--device", "cpu", "--no-promotion", "--from-scratch"]
+    assert main(["finetune", str(drives), "--config", str(config), *options, "-o", str(tmp_path / "run")]) == 0
+    checkpoint = tmp_path / "run" / "last.safetensors"
+    assert load_checkpoint(checkpoint).spec.volume == load_training_config(config).depth.volume
+    ran = ["--checkpoint", str(checkpoint), "-o", str(tmp_path / "depth.mcap"), "--quiet", "--backend", "torch_eager"]
+    assert main(["run", str(drives), *ran]) == 0
+    assert (tmp_path / "depth.mcap").stat().st_size > 1000

@@ -34,7 +34,13 @@ VOLUME = VolumeSpec(
     voxel_channels=6,
 )
 SPEC = DepthModelSpec(
-    network="vfdepth", height=HEIGHT, width=WIDTH, min_depth=0.5, max_depth=50, volume=VOLUME.model_dump()
+    network="vfdepth",
+    encoder="efficientnet_lite0",
+    height=HEIGHT,
+    width=WIDTH,
+    min_depth=0.5,
+    max_depth=50,
+    volume=VOLUME.model_dump(),
 )
 
 
@@ -66,7 +72,7 @@ def lively(network: torch.nn.Module) -> torch.nn.Module:
     with torch.no_grad():
         for name, parameter in network.named_parameters():
             if "encoder" not in name and parameter.ndim > 1:
-                parameter.mul_(2.0)
+                parameter.mul_(3.0)
     return network.double().eval()
 
 
@@ -77,7 +83,7 @@ def network() -> FusedDepthNet:
 
 
 def apart(ours: Tensor, expected: Tensor) -> float:
-    return float((ours - expected).abs().max())
+    return float((ours - expected).detach().abs().max())
 
 
 @torch.inference_mode()
@@ -92,12 +98,13 @@ def test_any_number_of_cameras_in_any_order(network, cameras):
 
 
 @torch.inference_mode()
-def test_the_cameras_see_each_others_pictures(network):
+def test_the_neighbours_of_a_camera_see_its_picture_and_the_one_behind_it_does_not(network):
     rig = ring_rig(4)
     other = rig.images.clone()
     other[:, 1] = 1 - other[:, 1]
     changed = (network(rig._replace(images=other)) - network(rig)).abs().amax((0, 2, 3, 4))
-    assert float(changed.min()) > 1e-6
+    assert float(changed[:3].min()) > 1e-6
+    assert float(changed[3]) == 0
 
 
 @torch.inference_mode()
@@ -204,7 +211,7 @@ def test_the_mirrored_world_has_the_mirrored_volume():
         seen = seen._replace(masks=torch.ones_like(seen.masks))
         geometry = fusion_geometry(VOLUME, voxel_views(VOLUME, seen), ring_of(seen.base_T_camera), size)
         found.append(fusion(maps, geometry).view(4, 12, 12, 6))
-    assert apart(found[1].flip(1), found[0]) < 1e-12  # the grid is the same to the left and to the right
+    assert apart(found[1].flip(1), found[0]) < 1e-6  # the grid is the same to the left and to the right
 
 
 # --- specs, checkpoints, released weights
@@ -254,7 +261,7 @@ def released(tmp_path):
     torch.manual_seed(5)
     for name, network, names in (
         ("depth_net", build_depth_network(SPEC), DEPTH_NAMES),
-        ("pose_net", VolumePoseNet("resnet18", VOLUME), POSE_NAMES),
+        ("pose_net", VolumePoseNet(SPEC.encoder, VOLUME), POSE_NAMES),
     ):
         state = renamed(network.state_dict(), {ours: theirs for theirs, ours in names.items()})
         torch.save({f"module.{key}": value for key, value in state.items()}, tmp_path / f"{name}.pth")
