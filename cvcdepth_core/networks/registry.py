@@ -21,7 +21,7 @@ from cvcdepth_core.model_choices import ENCODERS
 from cvcdepth_core.networks.depth import INPUT_STRIDE, MIN_INPUT_SIZE, DepthNet
 from cvcdepth_core.networks.rig_conditioned import RigConditionedNet
 from cvcdepth_core.networks.rig_images import DepthNetwork
-from cvcdepth_core.networks.vfdepth import DEPTH_NAMES, POSE_NAMES, FusedDepthNet
+from cvcdepth_core.networks.vfdepth import DEPTH_NAMES, POSE_NAMES, CorrectedFusedDepthNet, FusedDepthNet
 from cvcdepth_core.networks.volume import VolumeSpec
 
 PER_CAMERA = "per_camera"
@@ -117,7 +117,8 @@ class DepthModelSpec(BaseModel):
 
 
 def _fused(spec: DepthModelSpec) -> FusedDepthNet:
-    return FusedDepthNet(spec.encoder, spec.volume or VolumeSpec())
+    volume = spec.volume or VolumeSpec()
+    return (CorrectedFusedDepthNet if volume.corrected else FusedDepthNet)(spec.encoder, volume)
 
 
 class NetworkDescription(NamedTuple):

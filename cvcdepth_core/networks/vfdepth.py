@@ -51,7 +51,7 @@ class FusedDepthNet(DepthNetwork):
     """The published network: features of all cameras in a volume, and each camera's view of it decoded."""
 
     independent: ClassVar[bool] = False
-    engines: ClassVar[tuple[str, ...]] = ("torch_eager",)
+    engines: ClassVar[tuple[str, ...]] = ("torch_eager", "onnxruntime")
     mirror_offset: ClassVar[int] = STRIDE - 1
 
     def __init__(self, encoder: str, volume: VolumeSpec) -> None:
@@ -96,6 +96,12 @@ class FusedDepthNet(DepthNetwork):
         views = torch.cat([rig.base_T_camera, base_T_novel], dim=1)
         own, novel = self.disparity(rig.images, self.geometry(rig, views)).chunk(2, dim=1)
         return own, novel
+
+
+class CorrectedFusedDepthNet(FusedDepthNet):
+    """The same, of a volume that is `corrected`: how many cameras a voxel is made of depends on the rig."""
+
+    engines: ClassVar[tuple[str, ...]] = ("torch_eager",)
 
 
 def _repeated(features: Tensor, samples: int, copies: int) -> Tensor:

@@ -173,7 +173,7 @@ def voxel_centres(volume: VolumeSpec, like: Tensor) -> Tensor:
 def project_voxels(volume: VolumeSpec, rig: RigImages) -> tuple[Tensor, Tensor]:
     """Return pixels [B, N, V, 2] of the feature maps and depth [B, N, V] of every voxel, behind the camera too."""
     rotation, translation = rig.base_T_camera[..., :3, :3], rig.base_T_camera[..., :3, 3:]
-    in_camera = rotation.mT @ (voxel_centres(volume, translation) - translation)
+    in_camera = rotation.transpose(-1, -2) @ (voxel_centres(volume, translation) - translation)
     u, v, z = (feature_intrinsics(rig.intrinsics) @ in_camera).unbind(-2)
     return torch.stack([u, v], dim=-1) / (z + _PROJECTION_EPSILON)[..., None], in_camera[..., 2, :]
 
@@ -308,7 +308,7 @@ def ray_geometry(volume: VolumeSpec, intrinsics: Tensor, base_T_camera: Tensor, 
     rays = _rays(feature_intrinsics(intrinsics), size)
     depths = torch.linspace(volume.nearest, volume.farthest, volume.steps, dtype=rays.dtype, device=rays.device)
     rotation, translation = base_T_camera[..., :3, :3], base_T_camera[..., :3, 3]
-    points = (rotation @ rays).mT[..., None, :] * depths[:, None] + translation[:, :, None, None]
+    points = (rotation @ rays).transpose(-1, -2)[..., None, :] * depths[:, None] + translation[:, :, None, None]
     first, step = (points.new_tensor(part) for part in (volume.first_voxel, volume.voxel_size))
     near = interpolated(((points - first) / step).flatten(0, -2), volume.voxels)
     sample = torch.arange(len(points), device=points.device, dtype=torch.int32) * volume.count

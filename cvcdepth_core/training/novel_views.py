@@ -113,5 +113,5 @@ def _depth_range(batch: RigBatch, novel: NovelViews, targets: Tensor, corrected:
 def smoothness_of_views(disparity: Tensor) -> Tensor:
     """Return the smoothness [...] of disparity [..., 1, H, W] relative to its mean; there is no picture with edges."""
     relative = disparity / (disparity.mean(dim=(-2, -1), keepdim=True) + _EPSILON)
-    along_x, along_y = (relative.diff(dim=dim).abs().mean((-3, -2, -1)) for dim in (-1, -2))
-    return along_x + along_y
+    changes: list[Tensor] = [relative.diff(dim=dim).abs().mean((-3, -2, -1)) for dim in (-1, -2)]
+    return changes[0] + changes[1]

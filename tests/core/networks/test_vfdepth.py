@@ -191,6 +191,7 @@ def test_the_corrected_volume_is_the_published_one_where_two_cameras_at_most_see
     other.load_state_dict(network.state_dict())
     assert int(network.geometry(rig).fusion.views.max()) == 2
     assert apart(other(rig), network(rig)) < 1e-12
+    assert other.engines == ("torch_eager",)  # an exported one has a number of cameras for each voxel
 
 
 @torch.inference_mode()
