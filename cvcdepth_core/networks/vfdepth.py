@@ -48,7 +48,7 @@ class VolumeGeometry(NamedTuple):
 
 
 class FusedDepthNet(DepthNetwork):
-    """The published network: features of all cameras in a volume, and each camera's view of it decoded."""
+    """VFDepth: features of all cameras in a volume, and each camera's view of that decoded."""
 
     independent: ClassVar[bool] = False
     engines: ClassVar[tuple[str, ...]] = ("torch_eager", "onnxruntime")

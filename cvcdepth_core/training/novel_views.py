@@ -78,8 +78,8 @@ def consistency_of_views(batch: RigBatch, depth: Tensor, novel: NovelViews, corr
     own = novel.depth[:, pairs[0]]
     error = ((own - warp.images).abs() / (own + warp.images + _EPSILON)).clamp(0, 1)
     sums = torch.stack([error * warp.masks, warp.masks]).sum((-3, -2, -1))
-    total, weight = sums.new_zeros(2, len(depth), batch.cameras).index_add(-1, pairs[0], sums)
-    return total / (weight + _EPSILON)
+    of_cameras: Tensor = sums.new_zeros(2, len(depth), batch.cameras).index_add(-1, pairs[0], sums)
+    return of_cameras[0] / (of_cameras[1] + _EPSILON)
 
 
 def warped_depth(batch: RigBatch, depth: Tensor, novel: NovelViews, corrected: bool) -> tuple[Warp, Tensor]:

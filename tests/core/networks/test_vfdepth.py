@@ -21,6 +21,8 @@ from cvcdepth_core.networks.volume import (
     ring_of,
     voxel_views,
 )
+from cvcdepth_core.training.config import TrainingConfig
+from cvcdepth_core.training.starting_model import build_surround_model
 
 HEIGHT, WIDTH = 64, 96
 VOLUME = VolumeSpec(
@@ -216,6 +218,14 @@ def test_the_mirrored_world_has_the_mirrored_volume():
 
 
 # --- specs, checkpoints, released weights
+
+
+def test_training_does_not_start_from_weights_of_another_volume(network, tmp_path):
+    path = tmp_path / "fused.safetensors"
+    save_checkpoint(path, SPEC, network.state_dict())
+    other = SPEC.model_copy(update={"volume": VOLUME.model_copy(update={"farthest": 30.0})})
+    with pytest.raises(CheckpointError, match=r"volume is .*farthest=10.0.* depth.volume is .*farthest=30.0"):
+        build_surround_model(TrainingConfig(depth=other), load_checkpoint(path))
 
 
 def test_a_checkpoint_carries_the_volume_and_gives_the_same_depth(network, tmp_path):
