@@ -131,6 +131,7 @@ def _job(arguments: argparse.Namespace, config: "TrainingConfig") -> "FinetuneJo
         lidar_topics(arguments),
         arguments.base_frame,
         config.recordings.motion,
+        checkpoint_path(arguments.start or ""),
     )
     start = None if arguments.start is None else load_checkpoint(checkpoint_path(arguments.start))
     with_promotion = not arguments.no_promotion

@@ -59,9 +59,9 @@ class RunSettings(OutputSettings, MissingCameraSettings, MatchingSettings, Model
     """Store how sure depth is also where it is not refined; refined depth always has its confidence."""
 
     @property
-    def has_confidence(self) -> bool:
-        """Whether confidence is computed and stored."""
-        return self.confidence or self.needs_confidence or self.refine != "off"
+    def wants_confidence(self) -> bool:
+        """Whether confidence is computed and stored whatever becomes of depth."""
+        return self.confidence or self.needs_confidence
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -92,7 +92,7 @@ def execute(arguments: argparse.Namespace) -> None:
 
         replay = SurroundReplay(_recorded_rig(arguments, recording), settings, settings.min_cameras)
         with _trace(arguments.trace) as latencies:
-            depths = DepthReplay(replay, settings.build_estimator(), latencies, settings, settings.has_confidence)
+            depths = DepthReplay(replay, settings.build_estimator(), latencies, settings, settings.wants_confidence)
             outcome = _record(arguments, settings, replay, depths)
         result = {
             "version": package_version(),
@@ -141,7 +141,7 @@ def _record(
     with (
         _stoppable() as stop,
         DepthRecorder(
-            arguments.output, replay, settings, settings.clouds, window[0], settings.has_confidence
+            arguments.output, replay, settings, settings.clouds, window[0], depths.refinement.is_active
         ) as recorder,
     ):
         sets = depths.sets(*window, recorder.handlers)

@@ -14,13 +14,17 @@ from pathlib import Path
 
 from cvcdepth_core.errors import CvcDepthError, RecordingError
 from cvcdepth_core.files import write_atomically
+from cvcdepth_core.networks.checkpoint import load_checkpoint
+from cvcdepth_core.refinement.odometry_check import STEPS_TO_JUDGE
 from cvcdepth_core.rig.rig_file import RigLayout
 from cvcdepth_core.training.config import MotionSource
 from cvcdepth_ros.bags import Location, file_identities, open_recording
 from cvcdepth_ros.checks import CheckContext, CheckOptions, CheckResult, NumberedResult, run_checks
 from cvcdepth_ros.installation import package_version
 from cvcdepth_ros.kept import Arrays, KeptResults, document_array, read_document
-from cvcdepth_ros.settings import MatchingSettings
+from cvcdepth_ros.recordings.compared_pictures import JudgedOdometry, judge_odometry, parts_of
+from cvcdepth_ros.recordings.rig import RecordedRig
+from cvcdepth_ros.settings import MatchingSettings, ModelSettings
 from cvcdepth_ros.training_data.index import RecordingIndex, ScaleSource, load_index
 from cvcdepth_ros.training_data.own_body_masks import find_self_occlusion, save_masks
 
@@ -31,6 +35,8 @@ COUNTED_HERE: Collection[str] = ("training", "pose network")
 """Checks of what a run finds out by itself, from the very recordings that are left."""
 
 _CHECKS_FOLDER, _INDEX_FOLDER, _MASKS_FOLDER, _FOUND_FILE = "checks", "index", "masks", "found.json"
+_ODOMETRY_FOLDER, _WITHOUT_MOTION_FOLDER = "odometry", "without_motion"
+_JUDGED_PARTS, _JUDGED_SECONDS = 2, 2.5  # of a recording, whose motion is compared with the pictures
 
 
 @dataclass(frozen=True)
@@ -50,6 +56,8 @@ class Source:
     """The vehicle's frame, where `layout` is None."""
     motion: MotionSource = "network"
     """`recordings.motion` of the configuration."""
+    checkpoint: Path | None = None
+    """Weights by whose depth recorded motion is compared with the pictures; None: it is taken as it is."""
 
     @property
     def scale_from(self) -> ScaleSource:
@@ -79,11 +87,9 @@ def prepare(source: Source, run: Path) -> Prepared:
             checks = check_results(path, source, run)
             problems = [found for found in checks if found.result.status in ("failed", "warning")]
             _refuse(path, problems)
-            index = load_index(
-                path, run / _INDEX_FOLDER, source.matching, source.layout, source.base_frame, source.scale_from
-            )
+            index, doubts = _index_with_motion(path, source, run)
             prepared.indexes.append(index)
-            prepared.warnings += [_describe_finding(path, problem) for problem in problems]
+            prepared.warnings += [*(_describe_finding(path, problem) for problem in problems), *doubts]
             prepared.warnings += [f"{path}: {loss}" for loss in index.losses]
         except (CvcDepthError, OSError) as error:
             prepared.left_out[str(path)] = str(error)
@@ -114,6 +120,63 @@ def check_results(path: Location, source: Source, run: Path) -> list[NumberedRes
 
     kept = KeptResults(run / _CHECKS_FOLDER, _checks_to_arrays, _checks_from_arrays)
     return kept.load_or_make(str(path), work, run_all)
+
+
+def _index_with_motion(path: Location, source: Source, run: Path) -> tuple[RecordingIndex, list[str]]:
+    """Return the recording's index, and what is doubtful about its motion.
+
+    Motion that contradicts the pictures is left out; RecordingError where the configuration insists on it.
+    """
+    folder, options = run / _INDEX_FOLDER, (source.matching, source.layout, source.base_frame)
+    index = load_index(path, folder, *options, source.scale_from)
+    if source.motion == "network":
+        return index, []
+    if index.poses is None:
+        is_silent = source.motion == "recorded"  # the loader refuses
+        return index, [] if is_silent else [f"{path}: no motion is recorded, so the pose network's is taken"]
+    judged = _judged_odometry(path, source, run, len(index))
+    if judged.is_usable:
+        return index, [f"{path}: {judged.problem}"] if judged.problem else []
+    if source.motion == "recorded":
+        raise RecordingError(f"{path}: {judged.problem}; with recordings.motion: auto the pose network's is taken")
+    index = load_index(path, folder / _WITHOUT_MOTION_FOLDER, *options, "overlaps", with_motion=False)
+    doubt = f"{path}: {judged.problem}, so it is not used, and the pose network's motion is taken"
+    return replace(index, motion_problem=judged.problem), [doubt]
+
+
+def _judged_odometry(path: Location, source: Source, run: Path, sets: int) -> JudgedOdometry:
+    """Compare recorded motion with the pictures of two short parts, now or before in the very same recording."""
+    if source.checkpoint is None or sets <= STEPS_TO_JUDGE:
+        return JudgedOdometry("", is_usable=True)
+    weights = load_checkpoint(source.checkpoint)
+    work = {
+        "version": package_version(),
+        "files": file_identities(path),
+        "matching": source.matching.model_dump(),
+        "rig": {"base_frame": source.base_frame} if source.layout is None else source.layout.model_dump(mode="json"),
+        "checkpoint": weights.sha256,
+    }
+
+    def judge_now() -> JudgedOdometry:
+        with open_recording(path) as recording:
+            recorded = RecordedRig.from_recording(recording, source.layout, source.base_frame).completed()
+            parts = parts_of(recording.start, recording.end + 1, _JUDGED_PARTS, _JUDGED_SECONDS)
+            network = ModelSettings.model_validate({"checkpoint": str(source.checkpoint)}).build_estimator()
+            try:
+                return judge_odometry(recorded, network, parts, source.matching)
+            except CvcDepthError as error:
+                return JudgedOdometry(f"motion cannot be compared with the pictures: {error}", is_usable=True)
+
+    kept = KeptResults(run / _ODOMETRY_FOLDER, _judged_to_arrays, _judged_from_arrays)
+    return kept.load_or_make(str(path), work, judge_now)
+
+
+def _judged_to_arrays(judged: JudgedOdometry) -> Arrays:
+    return {"judged": document_array(judged._asdict())}
+
+
+def _judged_from_arrays(arrays: Arrays) -> JudgedOdometry:
+    return JudgedOdometry(**read_document(arrays["judged"]))
 
 
 def _checks_to_arrays(checks: list[NumberedResult]) -> Arrays:
