@@ -56,10 +56,10 @@ class RecordingIndex:
     """Sets left out since they lie outside of the recorded motion."""
     motion_topic: str | None = None
     """Where the motion is recorded."""
-    motion_problem: str = ""
-    """Why recorded motion is not used, though there is some."""
     unread: tuple[str, ...] = ()
     """Descriptions of messages and sets that could not be read or used."""
+    motion_problem: str = ""
+    """Why recorded motion is not used, though there is some."""
 
     @property
     def times(self) -> NDArray[np.int64]:
@@ -100,7 +100,7 @@ def load_index(
     kept = KeptResults(directory, _to_arrays, partial(_from_arrays, path))
     return kept.load_or_make(
         str(path),
-        _work(path, matching, rig_layout, base_frame) | ({} if with_motion else {"motion": "not used"}),
+        {**_work(path, matching, rig_layout, base_frame), **({} if with_motion else {"motion": "not used"})},
         lambda: build_index(path, matching, rig_layout, base_frame, scale_from, with_motion),
     )
 

@@ -12,11 +12,10 @@ from recordings import JAZZY, Entry, changed, sample_entries, write_rosbag2
 from cvcdepth_core.errors import RecordingError
 from cvcdepth_core.model_choices import checkpoint_path
 from cvcdepth_core.training.config import MotionSource, RecordingsConfig
+from cvcdepth_ros.checks import CHECKS
 from cvcdepth_ros.finetuning.preparation import Prepared, Source, prepare
 from cvcdepth_ros.settings import MatchingSettings
 from cvcdepth_ros.training_data.sample_choice import describe_motion
-
-NOT_HERE = ("overlaps", "ego masks", "LiDAR", "brightness", "places")
 
 
 def there_and_back() -> Iterator[Entry]:
@@ -59,7 +58,7 @@ def corrected(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def prepared(recording: Path, run: Path, motion: MotionSource = "auto") -> Prepared:
     source = Source(
-        [recording], None, MatchingSettings(), NOT_HERE, False, (), motion=motion, checkpoint=checkpoint_path("")
+        [recording], None, MatchingSettings(), tuple(CHECKS), False, (), motion=motion, checkpoint=checkpoint_path("")
     )
     return prepare(source, run)
 
