@@ -134,7 +134,7 @@ class TrueDrive:
 
 
 def with_camera_of(surround: SurroundDepth, other: SurroundDepth, camera: int) -> SurroundDepth:
-    """The set with picture and depth of one camera taken from another set."""
+    """The set with picture and depth of one camera taken from a set of that camera alone."""
     depth, pictures = surround.depth.copy(), surround.pictures.copy()
-    depth[camera], pictures[camera] = other.depth[camera], other.pictures[camera]
+    depth[camera], pictures[camera] = other.depth[0], other.pictures[0]
     return replace(surround, depth=depth, pictures=pictures)

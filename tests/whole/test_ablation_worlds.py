@@ -16,7 +16,7 @@ TOOL = load_tool("ablation_worlds")
 
 TINY = """
 base: {shipped}
-depth: {{height: 32, width: 64, focal_scale: 32.0}}
+depth: {{height: 64, width: 64, focal_scale: 32.0}}
 optimizer: {{epochs: 1, decay_after_epochs: 1}}
 """
 
