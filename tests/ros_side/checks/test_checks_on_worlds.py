@@ -96,14 +96,14 @@ def test_a_turned_mount_is_found_by_name_and_size(drive: Path, truth: _TrueDepth
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        (Odometry(scale=1.4), "another scale: it drives 1.4"),
-        (Odometry(scale=0.001), "odometry stands still while the pictures move at 6.0 m/s"),
+        (Odometry(scale=1.4), r"another scale: it drives 1\.(3[6-9]|4[0-4]) times as far"),
+        (Odometry(scale=0.001), r"odometry stands still while the pictures move at [56]\.\d m/s"),
     ],
 )
 def test_wrong_odometry_is_told(drive: Path, truth: _TrueDepth, tmp_path: Path, wrong: Odometry, said: str):
     _, odometry = compared(with_odometry(drive, wrong, tmp_path / "wrong"), RIG, truth)
     assert odometry.status == "warning"
-    assert said in odometry.finding
+    assert re.search(said, odometry.finding)
 
 
 def with_odometry(drive: Path, odometry: Odometry, folder: Path) -> Path:
