@@ -2,11 +2,13 @@
 """`tools/ablation_worlds.py` with a budget of seconds: it runs through, goes on where it stood, and tells intervals."""
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from repository import load_tool
+from simple_worlds import street_spec
 
 from cvcdepth_core.training.config import load_training_config
 
@@ -31,7 +33,15 @@ def arguments(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def finished(arguments: list[str]) -> Path:
+def small_worlds() -> Iterator[None]:
+    """Drives on a street that is built in a moment."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(TOOL, "random_world", lambda seed, kind, seconds: street_spec(seed=seed))
+        yield
+
+
+@pytest.fixture(scope="module")
+def finished(arguments: list[str], small_worlds: None) -> Path:
     TOOL.main(arguments)
     return Path(arguments[1])
 
