@@ -17,6 +17,7 @@ from cvcdepth_core.networks import DepthNetwork, build_depth_network, disparity_
 from cvcdepth_core.networks.checkpoint import load_checkpoint
 from cvcdepth_core.networks.mirroring import fuse_with_mirrored, mirrored_pictures
 from cvcdepth_core.networks.registry import DepthModelSpec
+from cvcdepth_core.networks.volume import refuse_cameras_outside
 from cvcdepth_core.rig.ground import refuse_unlikely_ground
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.sky import beyond_measure, sky_in_pictures
@@ -86,6 +87,7 @@ class DepthEstimator:
         self.spec = spec
         self.weights_id = weights_id
         self.flip_fusion = flip_fusion
+        self._mirror_offset = network.mirror_offset
         self._engine = build_engine(network, spec, device, backend, precision, cpu_fallback)
 
     @classmethod
@@ -135,7 +137,8 @@ class DepthEstimator:
         with torch.inference_mode():
             found = self._predicted(surround)
             if self.flip_fusion != "none":
-                found = found.fused(self._predicted(mirrored_pictures(surround)), self.flip_fusion)
+                mirrored = mirrored_pictures(surround, self._mirror_offset)
+                found = found.fused(self._predicted(mirrored), self.flip_fusion)
         return found.arrays()
 
     def sky(self, surround: SurroundPictures, depth: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -200,10 +203,13 @@ class SurroundDepthEstimator:
     def __init__(self, rig: Rig, estimator: DepthPredictor, known: "SurroundDepthEstimator | None" = None) -> None:
         """Prepare the maps; those of `known` are taken over for the cameras that have not changed.
 
-        RigError names the camera where the network is told the rig, and the rig cannot be right about the ground.
+        RigError names the camera where the network is told the rig, and the rig cannot be right about the ground, or
+        where the network's volume does not contain it.
         """
         if is_told_its_rig(estimator):
             refuse_unlikely_ground(rig)
+        if isinstance(estimator, DepthEstimator) and estimator.spec.volume is not None:
+            refuse_cameras_outside(estimator.spec.volume, rig.poses_above_ground, rig.names)
         self.rig = rig
         self.estimator = estimator
         self.preprocessor: SurroundPreprocessor = SurroundPreprocessor(

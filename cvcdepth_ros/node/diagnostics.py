@@ -8,9 +8,9 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from cvcdepth_core.estimator import DepthEstimator
+from cvcdepth_core.obstacles.ground import GroundPlane
 from cvcdepth_core.rig.ground import is_on_ground, unstated_ground
 from cvcdepth_core.rig.rig_file import RigLayout
-from cvcdepth_core.obstacles.ground import GroundPlane
 from cvcdepth_core.rig_health.overlap_monitor import OverlapMonitor
 from cvcdepth_ros.live.camera_states import CameraCondition, CameraState, CameraWatch
 from cvcdepth_ros.live.mailbox import MailboxStatistics
