@@ -99,7 +99,7 @@ class Sensors(Part):
 def random_look(dice: Dice) -> CameraLook:
     """Think up a camera."""
     return CameraLook(
-        key=dice.scale(0.15, 0.33),
+        key=dice.scale(0.17, 0.34),
         white_balance=(dice.scale(0.88, 1.14), 1.0, dice.scale(0.88, 1.14)),
         gamma=dice.between(1.9, 2.5),
         contrast=dice.between(0.88, 1.2),
