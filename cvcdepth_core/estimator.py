@@ -3,7 +3,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -51,6 +51,17 @@ class DepthPredictor(Protocol):
 
     def estimate(self, surround: SurroundPictures) -> NDArray[np.float32]:
         """Return depth [N, H, W] in metres of one set; absent cameras' means nothing."""
+
+
+class PredictedDepth(NamedTuple):
+    """What a network says of the pictures of one set, [N, H, W] each; absent cameras' means nothing."""
+
+    depth: NDArray[np.float32]
+    """Metres along the optical axis."""
+    sky: NDArray[np.float32] | None = None
+    """Probability that the pixel shows the sky, whose depth is the farthest there is; None where it is not told."""
+    log_uncertainty: NDArray[np.float32] | None = None
+    """Natural logarithm of the error of log depth that is to be expected; None where it is not told."""
 
 
 class DepthEstimator:
@@ -111,27 +122,59 @@ class DepthEstimator:
         return self._engine.independent
 
     def estimate(self, surround: SurroundPictures) -> NDArray[np.float32]:
-        """Return depth [N, H, W] in metres of one set; absent cameras' means nothing.
+        """Return depth [N, H, W] in metres of one set; see `details`."""
+        return self.details(surround).depth
+
+    def details(self, surround: SurroundPictures) -> PredictedDepth:
+        """Return depth of one set and what else the network says.
 
         On a CPU an independent camera's depth does not depend on the others to the last bit. Raises EngineError when
         the device fails or has too little memory.
         """
         with torch.inference_mode():
-            depth = self._depth(surround)
+            found = self._predicted(surround)
             if self.flip_fusion != "none":
-                depth = fuse_with_mirrored(depth, self._depth(mirrored_pictures(surround)), self.flip_fusion)
-        metres: NDArray[np.float32] = depth[:, 0].numpy()
-        return metres
+                found = found.fused(self._predicted(mirrored_pictures(surround)), self.flip_fusion)
+        return found.arrays()
 
-    def _depth(self, surround: SurroundPictures) -> torch.Tensor:
-        """Return the network's depth [N, 1, H, W] in metres."""
-        return disparity_to_depth(
-            self._engine.disparity(surround),
+    def _predicted(self, surround: SurroundPictures) -> "_Predicted":
+        outputs = self._engine.details(surround)
+        depth = disparity_to_depth(
+            outputs.disparity,
             torch.as_tensor(surround.fx, dtype=torch.float32),
             self.spec.min_depth,
             self.spec.max_depth,
             self.spec.focal_scale,
         )
+        sky = None if outputs.sky is None else torch.sigmoid(outputs.sky)
+        return _Predicted(depth, sky, outputs.log_uncertainty)
+
+
+class _Predicted(NamedTuple):
+    """As `PredictedDepth`, [N, 1, H, W] each."""
+
+    depth: torch.Tensor
+    sky: torch.Tensor | None
+    log_uncertainty: torch.Tensor | None
+
+    def fused(self, mirrored: "_Predicted", fusion: FlipFusion) -> "_Predicted":
+        """Return both passes as one; beside depth, by the mean of both."""
+        depth = fuse_with_mirrored(self.depth, mirrored.depth, fusion)
+        others = (
+            None if one is None or other is None else fuse_with_mirrored(one, other, "depth")
+            for one, other in zip(self[1:], mirrored[1:], strict=True)
+        )
+        return _Predicted(depth, *others)
+
+    def arrays(self) -> PredictedDepth:
+        """Return them without the channel."""
+        sky, log_uncertainty = (None if part is None else part[:, 0].numpy() for part in self[1:])
+        return PredictedDepth(self.depth[:, 0].numpy(), sky, log_uncertainty)
+
+
+def is_told_its_rig(predictor: DepthPredictor) -> bool:
+    """Say whether its depth depends on where the rig's cameras are and look, and how high above the ground."""
+    return isinstance(predictor, DepthEstimator) and predictor.spec.is_told_its_rig
 
 
 def untrained_network(spec: DepthModelSpec, seed: int = 0) -> DepthNetwork:
@@ -152,7 +195,7 @@ class SurroundDepthEstimator:
 
         RigError names the camera where the network is told the rig, and the rig cannot be right about the ground.
         """
-        if isinstance(estimator, DepthEstimator) and estimator.spec.is_told_its_rig:
+        if is_told_its_rig(estimator):
             refuse_unlikely_ground(rig)
         self.rig = rig
         self.estimator = estimator

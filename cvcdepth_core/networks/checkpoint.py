@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import hashlib
 import pickle
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import torch
 from pydantic import ValidationError
@@ -81,18 +83,24 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     """
     path = Path(path)
     digest = _sha256([path])
-    header, tensors = _read_safetensors(path)
-    version = header.pop(_VERSION_KEY, None)
-    if version != FORMAT_VERSION:
-        raise CheckpointError(f"{path}: format version is {version!r}, expected {FORMAT_VERSION!r}")
+    with _opened(path) as file:
+        header, tensors = dict(file.metadata() or {}), {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
     return Checkpoint(
         path=path,
-        spec=_parse_spec(path, header.pop(_SPEC_KEY, None)),
+        spec=_take_spec(path, header),
         depth_net=_without_prefix(_DEPTH_PREFIX, tensors),
         pose_net=_without_prefix(_POSE_PREFIX, tensors),
         sha256=digest,
         metadata=header,
     )
+
+
+def load_spec(path: str | Path) -> DepthModelSpec:
+    """Return what a checkpoint's network is for, without reading its weights; raises as `load_checkpoint`."""
+    path = Path(path)
+    _refuse_missing(path)
+    with _opened(path) as file:
+        return _take_spec(path, dict(file.metadata() or {}))
 
 
 def import_released(directory: str | Path, spec: DepthModelSpec) -> Checkpoint:
@@ -178,10 +186,12 @@ def _without_prefix(prefix: str, tensors: State) -> dict[str, Tensor]:
     }
 
 
-def _read_safetensors(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """Give a safetensors file; CheckpointError, also while it is read, says why it is none."""
     try:
         with safe_open(path, framework="pt") as file:
-            return dict(file.metadata() or {}), {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+            yield file
     except SafetensorError as error:
         raise CheckpointError(f"{path}: {_why_unreadable(path)}: {error}") from error
 
@@ -203,7 +213,11 @@ def _read_tensors_of_pickle(path: Path) -> dict[str, Tensor]:
     return dict(state)
 
 
-def _parse_spec(path: Path, text: str | None) -> DepthModelSpec:
+def _take_spec(path: Path, header: dict[str, str]) -> DepthModelSpec:
+    """Return the spec, and leave in the header what the writer added; CheckpointError where it is of another format."""
+    version, text = header.pop(_VERSION_KEY, None), header.pop(_SPEC_KEY, None)
+    if version != FORMAT_VERSION:
+        raise CheckpointError(f"{path}: format version is {version!r}, expected {FORMAT_VERSION!r}")
     if text is None:
         raise CheckpointError(f"{path}: has no model spec in its metadata")
     try:

@@ -102,8 +102,8 @@ class ConditionedNetwork(DepthNetwork):
         """Return [B, N, C, H, W], made of `rig`'s calibration and of the size of its images."""
 
     @abstractmethod
-    def disparity(self, images: Tensor, conditioning: Tensor) -> Tensor:
-        """Return the disparity [M, 1, H, W] in [0, 1] of images [M, 3, H, W] and their conditioning [M, C, H, W]."""
+    def outputs(self, images: Tensor, conditioning: Tensor) -> DepthOutputs:
+        """Return all outputs [M, 1, H, W] of images [M, 3, H, W] and their conditioning [M, C, H, W]."""
 
 
 def _float32(array: np.ndarray[Any, Any], device: torch.device | str) -> Tensor:

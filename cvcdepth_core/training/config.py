@@ -12,7 +12,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from cvcdepth_core.errors import ConfigError, validation_messages
 from cvcdepth_core.files import load_yaml
-from cvcdepth_core.model_choices import EncoderName
+from cvcdepth_core.model_choices import DEFAULT, EncoderName, checkpoint_path
+from cvcdepth_core.networks.checkpoint import load_spec
 from cvcdepth_core.networks.pose import MAX_TRANSLATION
 from cvcdepth_core.networks.registry import DepthModelSpec
 from cvcdepth_core.training.augmentation import ColorJitterConfig, FlipMode
@@ -215,16 +216,32 @@ class TrainingConfig(_Section):
         return self
 
 
-def load_training_config(path: str | Path) -> TrainingConfig:
+def load_training_config(path: str | Path, start: DepthModelSpec | None = None) -> TrainingConfig:
     """Read a training configuration; `base: FILE` names a file, relative to this one, that it builds on.
+
+    What it does not say of the network is as in `start`, what the weights that training begins with are for; a file
+    without a word of it, and without a start, means the network of the package's own model.
 
     Raises ConfigError naming the file, the field, the value found and what is allowed.
     """
     path = Path(path)
     try:
-        return TrainingConfig.model_validate(_read_with_bases(path, above=()))
+        return TrainingConfig.model_validate(_with_network(_read_with_bases(path, above=()), start))
     except ValidationError as error:
         raise ConfigError(f"{path}: {validation_messages(error, TrainingConfig)}") from error
+
+
+def _with_network(fields: dict[str, Any], start: DepthModelSpec | None) -> dict[str, Any]:
+    named = fields.get("depth", {})
+    if start is None and "depth" not in fields:
+        start = load_spec(checkpoint_path(DEFAULT))
+    if start is None or not isinstance(named, dict):
+        return fields
+    width = named.get("width")
+    # Depth goes with fx / focal_scale, and fx with the width.
+    scale = width / start.width if isinstance(width, int) else 1.0
+    known = {"network": start.network, **start.model_dump(), "focal_scale": start.focal_scale * scale}
+    return {**fields, "depth": known | named}
 
 
 def _read_with_bases(path: Path, above: tuple[Path, ...]) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from cvcdepth_ros.process_setup import prepare_long_work
 from cvcdepth_ros.reports import REPORT_FILE, can_draw_report
 
 if TYPE_CHECKING:
+    from cvcdepth_core.networks.checkpoint import Checkpoint
     from cvcdepth_core.training.config import TrainingConfig
     from cvcdepth_core.training.distributed import Processes
     from cvcdepth_ros.finetuning.run import FinetuneJob, FinetuneResult
@@ -89,13 +90,14 @@ def execute(arguments: argparse.Namespace) -> None:
     if arguments.keep_general is not None and not arguments.worlds:
         arguments.usage_error("argument --keep-general: needs --worlds, of which that share is")
     prepare_long_work()
-    config = _training_config(training_file(arguments.config))
+    start = _start(arguments)
+    config = _training_config(training_file(arguments.config), start)
     if arguments.keep_general is not None:
         worlds = config.worlds.model_copy(update={"share": arguments.keep_general})
         config = config.model_copy(update={"worlds": worlds})
     with launched_processes() as processes:
         with_report = processes.is_first and can_draw_report()
-        finished = _fine_tuned(arguments, config, processes)
+        finished = _fine_tuned(_job(arguments, config, start), processes)
     if finished is None:
         return
     result = _written(finished, with_report)
@@ -104,11 +106,19 @@ def execute(arguments: argparse.Namespace) -> None:
         raise NotPromotedError(f"{arguments.output / BEST_FILE} is not written: {finished.verdict.reason}")
 
 
-def _training_config(path: Path) -> "TrainingConfig":
+def _start(arguments: argparse.Namespace) -> "Checkpoint | None":
+    """Return the weights to start from; None: random ones."""
+    from cvcdepth_core.model_choices import checkpoint_path
+    from cvcdepth_core.networks.checkpoint import load_checkpoint
+
+    return None if arguments.start is None else load_checkpoint(checkpoint_path(arguments.start))
+
+
+def _training_config(path: Path, start: "Checkpoint | None") -> "TrainingConfig":
     """Read the training file; ConfigError where it is for a data set, of which there is no reader yet."""
     from cvcdepth_core.training.config import load_training_config
 
-    config = load_training_config(path)
+    config = load_training_config(path, start.spec if start else None)
     if config.dataset != "recording":
         why = "for `cvcdepth pretrain`" if config.dataset == "worlds" else "for which there is no reader yet"
         raise ConfigError(
@@ -118,13 +128,10 @@ def _training_config(path: Path) -> "TrainingConfig":
     return config
 
 
-def _fine_tuned(
-    arguments: argparse.Namespace, config: "TrainingConfig", processes: "Processes"
-) -> "FinetuneResult | None":
+def _fine_tuned(job: "FinetuneJob", processes: "Processes") -> "FinetuneResult | None":
     from cvcdepth_ros.finetuning.run import fine_tune
     from cvcdepth_ros.finetuning.tensorboard import WITHOUT_TENSORBOARD, has_tensorboard
 
-    job = _job(arguments, config)
     if processes.is_first and not has_tensorboard():
         warn(WITHOUT_TENSORBOARD)
     try:
@@ -134,9 +141,7 @@ def _fine_tuned(
         raise
 
 
-def _job(arguments: argparse.Namespace, config: "TrainingConfig") -> "FinetuneJob":
-    from cvcdepth_core.model_choices import checkpoint_path
-    from cvcdepth_core.networks.checkpoint import load_checkpoint
+def _job(arguments: argparse.Namespace, config: "TrainingConfig", start: "Checkpoint | None") -> "FinetuneJob":
     from cvcdepth_ros.bags import find_recordings
     from cvcdepth_ros.finetuning.preparation import Source
     from cvcdepth_ros.finetuning.run import FinetuneJob
@@ -152,8 +157,8 @@ def _job(arguments: argparse.Namespace, config: "TrainingConfig") -> "FinetuneJo
         lidar_topics(arguments),
         arguments.base_frame,
         config.recordings.motion,
+        config.depth.is_told_its_rig,
     )
-    start = None if arguments.start is None else load_checkpoint(checkpoint_path(arguments.start))
     with_promotion = not arguments.no_promotion
     shards = find_shards(arguments.worlds)
     return FinetuneJob(

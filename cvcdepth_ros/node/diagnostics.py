@@ -8,6 +8,8 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from cvcdepth_core.estimator import DepthEstimator
+from cvcdepth_core.rig.ground import is_on_ground, unstated_ground
+from cvcdepth_core.rig.rig_file import RigLayout
 from cvcdepth_core.rig_health.overlap_monitor import OverlapMonitor
 from cvcdepth_ros.live.camera_states import CameraCondition, CameraState, CameraWatch
 from cvcdepth_ros.live.mailbox import MailboxStatistics
@@ -97,6 +99,20 @@ def model_status(estimator: DepthEstimator) -> DiagnosticStatus:
     """Return the network's name, its device and the size of its input."""
     values = {"device": estimator.device, "height": estimator.spec.height, "width": estimator.spec.width}
     return status(OK, "model", estimator.model_id, values)
+
+
+def ground_status(layout: RigLayout) -> DiagnosticStatus:
+    """Return how high the ground lies for networks that are told it, and what helps where nobody says it."""
+    values = {f"ground in {layout.base_frame} (m)": layout.ground_z}
+    problem = ground_problem(layout)
+    told = f"{layout.ground_z:.2f} m in {layout.base_frame}"
+    return status(WARN if problem else OK, "ground", problem or told, values)
+
+
+def ground_problem(layout: RigLayout) -> str:
+    """Return that nobody says how high the ground lies, with the remedy; empty where somebody does."""
+    is_known = layout.ground_height is not None or is_on_ground(layout.base_frame)
+    return "" if is_known else unstated_ground(layout.base_frame)
 
 
 def overlap_status(monitor: OverlapMonitor) -> DiagnosticStatus:

@@ -7,8 +7,12 @@ import pytest
 from pydantic import BaseModel
 from repository import ROOT
 
-from cvcdepth_core.errors import ConfigError
+from cvcdepth_core.errors import CheckpointError, ConfigError
+from cvcdepth_core.model_choices import checkpoint_path
+from cvcdepth_core.networks.checkpoint import Checkpoint, load_spec
+from cvcdepth_core.networks.registry import DepthModelSpec
 from cvcdepth_core.training.config import TrainingConfig, load_training_config
+from cvcdepth_core.training.starting_model import build_surround_model
 
 SHIPPED = ROOT / "config" / "training"
 DEPTH = "depth: {height: 64, width: 96, min_depth: 1, max_depth: 80}\n"
@@ -98,7 +102,8 @@ def test_every_field_of_the_configuration_is_described():
         (DEPTH + "evaluation: {max_depth: .inf}", r"evaluation.max_depth is inf.*less than or equal to 10000"),
         (DEPTH.replace("64", "100"), r"depth.height is 100.*multiple of 32"),
         (DEPTH.replace("max_depth: 80", "max_depth: 0.5"), r"min_depth 1.0 must be below max_depth 0.5"),
-        ("seed: 1", r"depth is missing"),
+        ("depth: {height: 64}", r"depth.width is missing"),
+        ("depth: 64", r"depth is 64"),
         ("base: here.yaml", r"leads back to the file itself"),
         ("base: absent.yaml", r"absent.yaml: cannot be read"),
         ("base: 3", r"base is 3, expected the name of a file"),
@@ -122,3 +127,45 @@ def test_exposure_motion_may_be_a_switch(tmp_path, written, meant):
     config = load_training_config(path)
     assert config.recordings.exposure_motion == meant
     assert TrainingConfig.model_validate_json(config.model_dump_json()) == config
+
+
+STARTS = {
+    "per_camera": DepthModelSpec(
+        encoder="efficientnet_lite0", height=192, width=320, min_depth=0.5, max_depth=100.0, focal_scale=160.0
+    ),
+    "rig_conditioned": DepthModelSpec(
+        network="rig_conditioned", encoder="efficientnet_lite0", height=160, width=256, min_depth=0.4, max_depth=250.0,
+        focal_scale=128.0,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("start", STARTS.values(), ids=STARTS)
+def test_what_a_file_does_not_say_of_the_network_is_as_the_weights_have_it(tmp_path, start):
+    path = tmp_path / "config.yaml"
+    path.write_text("seed: 1\n")
+    assert load_training_config(path, start).depth == start
+    path.write_text("depth: {height: 96, width: 128}\n")
+    smaller = load_training_config(path, start).depth
+    assert (smaller.network, smaller.min_depth, smaller.max_depth) == (start.network, start.min_depth, start.max_depth)
+    assert (smaller.height, smaller.width, smaller.focal_scale) == (96, 128, 64.0)
+    assert load_training_config(SHIPPED / "finetune.yaml", start).depth == start
+
+
+def test_what_a_file_says_of_the_network_stays_and_other_weights_are_refused(tmp_path):
+    path = tmp_path / "config.yaml"
+    path.write_text("depth: {network: per_camera, max_depth: 100}\n")
+    config = load_training_config(path, STARTS["rig_conditioned"])
+    assert (config.depth.network, config.depth.max_depth, config.depth.min_depth) == ("per_camera", 100, 0.4)
+    weights = Checkpoint(path, STARTS["rig_conditioned"], {}, {}, "")
+    with pytest.raises(CheckpointError, match=r"network is rig_conditioned, but the configuration's depth.network is"):
+        build_surround_model(config, weights)
+    path.write_text("depth: {encoder: resnet34}\n")
+    with pytest.raises(ConfigError, match=r"config.yaml: depth.*encoder is resnet34, but the network rig_conditioned"):
+        load_training_config(path, STARTS["rig_conditioned"])
+
+
+def test_without_weights_and_a_word_of_the_network_it_is_that_of_the_packages_model(tmp_path):
+    path = tmp_path / "config.yaml"
+    path.write_text("seed: 1\n")
+    assert load_training_config(path).depth == load_spec(checkpoint_path("default"))
