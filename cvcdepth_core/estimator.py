@@ -17,8 +17,10 @@ from cvcdepth_core.networks import DepthNetwork, build_depth_network, disparity_
 from cvcdepth_core.networks.checkpoint import load_checkpoint
 from cvcdepth_core.networks.mirroring import fuse_with_mirrored, mirrored_pictures
 from cvcdepth_core.networks.registry import DepthModelSpec
+from cvcdepth_core.networks.volume import refuse_cameras_outside
 from cvcdepth_core.rig.ground import refuse_unlikely_ground
 from cvcdepth_core.rig.rig import Rig
+from cvcdepth_core.sky import beyond_measure, sky_in_pictures
 from cvcdepth_core.surround_depth import SurroundDepth, SurroundPictures
 
 
@@ -85,6 +87,7 @@ class DepthEstimator:
         self.spec = spec
         self.weights_id = weights_id
         self.flip_fusion = flip_fusion
+        self._mirror_offset = network.mirror_offset
         self._engine = build_engine(network, spec, device, backend, precision, cpu_fallback)
 
     @classmethod
@@ -134,8 +137,15 @@ class DepthEstimator:
         with torch.inference_mode():
             found = self._predicted(surround)
             if self.flip_fusion != "none":
-                found = found.fused(self._predicted(mirrored_pictures(surround)), self.flip_fusion)
+                mirrored = mirrored_pictures(surround, self._mirror_offset)
+                found = found.fused(self._predicted(mirrored), self.flip_fusion)
         return found.arrays()
+
+    def sky(self, surround: SurroundPictures, depth: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Return where a set shows the sky [N, H, W], by its `depth` where the network knows the sky, else by looks."""
+        if self.spec.tells_sky:
+            return beyond_measure(depth, surround.fx, self.spec.max_depth, self.spec.focal_scale)
+        return sky_in_pictures(surround, depth)
 
     def _predicted(self, surround: SurroundPictures) -> "_Predicted":
         outputs = self._engine.details(surround)
@@ -193,10 +203,13 @@ class SurroundDepthEstimator:
     def __init__(self, rig: Rig, estimator: DepthPredictor, known: "SurroundDepthEstimator | None" = None) -> None:
         """Prepare the maps; those of `known` are taken over for the cameras that have not changed.
 
-        RigError names the camera where the network is told the rig, and the rig cannot be right about the ground.
+        RigError names the camera where the network is told the rig, and the rig cannot be right about the ground, or
+        where the network's volume does not contain it.
         """
         if is_told_its_rig(estimator):
             refuse_unlikely_ground(rig)
+        if isinstance(estimator, DepthEstimator) and estimator.spec.volume is not None:
+            refuse_cameras_outside(estimator.spec.volume, rig.poses_above_ground, rig.names)
         self.rig = rig
         self.estimator = estimator
         self.preprocessor: SurroundPreprocessor = SurroundPreprocessor(
@@ -218,7 +231,8 @@ class SurroundDepthEstimator:
         if pictures.present.any():
             known = pictures.valid & pictures.present[:, None, None]
             np.copyto(depth, self.estimator.estimate(pictures), where=known)
-        return SurroundDepth(depth, pictures.pictures, pictures.intrinsics, pictures.present)
+        sky = self.estimator.sky(pictures, depth) if isinstance(self.estimator, DepthEstimator) else None
+        return SurroundDepth(depth, pictures.pictures, pictures.intrinsics, pictures.present, sky=sky)
 
     def _surround_pictures(self, rectified: Sequence[Picture | None]) -> SurroundPictures:
         pictures = np.zeros((*self.preprocessor.valid.shape, 3), dtype=np.uint8)

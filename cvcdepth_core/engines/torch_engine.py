@@ -9,13 +9,14 @@ from collections.abc import Callable, Mapping
 import torch
 from torch import Tensor, nn
 
-from cvcdepth_core.engines.conditioning import KeptForRig, conditioning_of
+from cvcdepth_core.engines.conditioning import KeptForRig, KeptForWholeRig, conditioning_of
 from cvcdepth_core.engines.engine import best_chunk, image_by_image
 from cvcdepth_core.engines.rewriting import RewrittenDepthNet
 from cvcdepth_core.engines.rewriting_conditioned import RewrittenRigConditionedNet, ToldDetails
 from cvcdepth_core.model_choices import Precision
 from cvcdepth_core.networks import ConditionedNetwork, DepthNet, DepthNetwork, DepthOutputs, RigImages
 from cvcdepth_core.networks.rig_conditioned import RigConditionedNet
+from cvcdepth_core.networks.vfdepth import FusedDepthNet
 
 
 class TorchEagerEngine:
@@ -29,6 +30,7 @@ class TorchEagerEngine:
         self._told = (
             KeptForRig(conditioning_of(self._network)) if isinstance(self._network, ConditionedNetwork) else None
         )
+        self._geometry = KeptForWholeRig(self._network.geometry) if isinstance(self._network, FusedDepthNet) else None
 
     def disparity(self, rig: RigImages) -> Tensor:
         """See `DisparityEngine`."""
@@ -40,6 +42,8 @@ class TorchEagerEngine:
         if isinstance(self._network, ConditionedNetwork) and self._told is not None:
             found = self._network.outputs(rig.images.flatten(0, 1), *self._told(rig))
             return found.map(lambda part: part.view(*rig.images.shape[:2], *part.shape[1:]))
+        if isinstance(self._network, FusedDepthNet) and self._geometry is not None:
+            return DepthOutputs(self._network.disparity(rig.images, self._geometry(rig)))
         return self._network.details(rig)
 
 

@@ -23,8 +23,9 @@ from torch import Tensor, nn
 from cvcdepth_core.errors import CheckpointError, validation_messages
 from cvcdepth_core.files import write_atomically
 from cvcdepth_core.networks.encoders import Encoder
-from cvcdepth_core.networks.registry import DepthModelSpec, build_depth_network
+from cvcdepth_core.networks.registry import RELEASED_NAMES, DepthModelSpec, build_depth_network
 from cvcdepth_core.networks.rig_images import DepthNetwork
+from cvcdepth_core.networks.vfdepth import VolumePoseNet, renamed
 
 FORMAT_VERSION = "1"
 
@@ -104,17 +105,28 @@ def load_spec(path: str | Path) -> DepthModelSpec:
 
 
 def import_released(directory: str | Path, spec: DepthModelSpec) -> Checkpoint:
-    """Read the authors' `weights_<n>/{depth_net,pose_net}.pth` (method section 10).
+    """Read the authors' `weights_<n>/{depth_net,pose_net}.pth` (method section 10), or those of VFDepth's authors.
 
-    `spec` says what they were trained for. Raises CheckpointError naming the file when one is missing, damaged, holds
-    more than tensors, or does not fit `spec`.
+    `spec` says what they were trained for, and so whose they are. Raises CheckpointError naming the file when one is
+    missing, damaged, holds more than tensors, or does not fit `spec`.
     """
     files = [Path(directory) / "depth_net.pth", Path(directory) / "pose_net.pth"]
     digest = _sha256(files)
-    depth_net, pose_net = (_without_prefix(_RELEASED_PREFIX, _read_tensors_of_pickle(file)) for file in files)
+    names = RELEASED_NAMES.get(spec.network, ({}, {}))
+    depth_net, pose_net = (renamed(_released_state(file), of_file) for file, of_file in zip(files, names, strict=True))
     checkpoint = Checkpoint(Path(directory), spec, depth_net, pose_net, digest)
     checkpoint.build_depth_net()
+    if spec.volume is not None:
+        load_network_state(
+            VolumePoseNet(spec.encoder, spec.volume), pose_net, f"{files[1]}: pose network ({spec.kind})"
+        )
     return checkpoint
+
+
+def _released_state(file: Path) -> dict[str, Tensor]:
+    """Return a file's tensors; networks that were trained by several processes have a prefix."""
+    tensors = _read_tensors_of_pickle(file)
+    return _without_prefix("", {key.removeprefix(_RELEASED_PREFIX): value for key, value in tensors.items()})
 
 
 def half_precision(state: State) -> dict[str, Tensor]:

@@ -81,6 +81,9 @@ class DepthNetwork(nn.Module, ABC):
     chunks, and one that nobody wants need not be computed."""
     engines: ClassVar[tuple[str, ...]]
     """The backends that can run it, the one that `auto` takes first where it is installed at the front."""
+    mirror_offset: ClassVar[int] = 0
+    """Pixels by which a mirrored picture's principal point has to lie left of the place that mirroring gives it, for
+    networks that take a feature's place for that of the first of its pixels: see `mirror_rig`."""
 
     @abstractmethod
     def forward(self, rig: RigImages) -> Tensor:

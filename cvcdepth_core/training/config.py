@@ -18,6 +18,7 @@ from cvcdepth_core.networks.pose import MAX_TRANSLATION
 from cvcdepth_core.networks.registry import DepthModelSpec
 from cvcdepth_core.training.augmentation import ColorJitterConfig, FlipMode
 from cvcdepth_core.training.model import PoseMethod
+from cvcdepth_core.training.novel_views import NovelViewsConfig
 from cvcdepth_core.training.objective import ObjectiveConfig
 
 ExposureMotion = Literal["auto", "recorded", "network", "none"]
@@ -189,6 +190,8 @@ class TrainingConfig(_Section):
     """Weights and variants of the loss."""
     augmentation: AugmentationConfig = AugmentationConfig()
     """Changes to samples."""
+    synthesis: NovelViewsConfig = NovelViewsConfig()
+    """For the objective's `synthesis_...` terms: how far the cameras are turned."""
     recordings: RecordingsConfig = RecordingsConfig()
     """For `dataset: recording`: which moments become samples, and how they are read."""
     worlds: WorldsConfig = WorldsConfig()
@@ -212,6 +215,17 @@ class TrainingConfig(_Section):
             raise ValueError(
                 f"objective.pose_consistency is {self.objective.pose_consistency}, which compares the cameras' own "
                 f"motions, but pose.method is {self.pose.method!r}, expected 'per_camera'"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _synthesis_has_a_volume(self) -> TrainingConfig:
+        loss, volume = self.objective, self.depth.volume
+        if loss.synthesises and (volume is None or volume.skips):
+            raise ValueError(
+                f"objective.synthesis_consistency is {loss.synthesis_consistency:g} and synthesis_smoothness "
+                f"{loss.synthesis_smoothness:g}, but depth.network is {self.depth.network}, "
+                + ("expected vfdepth" if volume is None else "whose skips show a turned camera another one's picture")
             )
         return self
 
@@ -241,6 +255,8 @@ def _with_network(fields: dict[str, Any], start: DepthModelSpec | None) -> dict[
     # Depth goes with fx / focal_scale, and fx with the width.
     scale = width / start.width if isinstance(width, int) else 1.0
     known = {"network": start.network, **start.model_dump(), "focal_scale": start.focal_scale * scale}
+    if named.get("network", start.network) != start.network:
+        known.pop("volume", None)
     return {**fields, "depth": known | named}
 
 

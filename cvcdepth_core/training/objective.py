@@ -29,6 +29,7 @@ from cvcdepth_core.rendering.view_synthesis import (
 from cvcdepth_core.training.batch import RigBatch
 from cvcdepth_core.training.losses import auto_mask, motion_error, pose_consistency, smoothness
 from cvcdepth_core.training.motion import motions_seen_from_anchor, relative_poses
+from cvcdepth_core.training.novel_views import NovelViews, consistency_of_views, smoothness_of_views
 from cvcdepth_core.training.truth_losses import LogErrors, sky_error
 
 _IDENTITY_NOISE = 1e-5
@@ -54,6 +55,10 @@ class ObjectiveConfig(BaseModel):
     """Weight of the difference between spatial and spatio-temporal reconstructions (MVRCL)."""
     pose_consistency: float = Field(default=0.0, ge=0)
     """Weight of the agreement of the cameras' own motions (FSM baseline: 0.1); only with one pose per camera."""
+    synthesis_consistency: float = Field(default=0.0, ge=0)
+    """Weight of the difference between depth at turned cameras and the cameras' own; only with `network: vfdepth`."""
+    synthesis_smoothness: float = Field(default=0.0, ge=0)
+    """Weight of the smoothness of disparity at turned cameras."""
     recorded_motion: float = Field(default=1.0, ge=0)
     """Weight of the pose network's difference to the recorded motion, see `losses.motion_error`; there is no such term
     where none is recorded, or `recordings.motion` does not take it."""
@@ -75,7 +80,12 @@ class ObjectiveConfig(BaseModel):
     corrected: bool = False
     """Depart from the published method: refuse points behind a camera, take the deviation for the intensity alignment
     over the overlap only, average instead of add where two neighbours see the same pixel, binarise masks, and leave
-    what they mask out of the smoothness."""
+    what they mask out of the smoothness; of novel views, take the range that the lens gives."""
+
+    @property
+    def synthesises(self) -> bool:
+        """Whether a term needs the views of turned cameras."""
+        return max(self.synthesis_consistency, self.synthesis_smoothness) > 0
 
 
 @dataclass(frozen=True)
@@ -92,6 +102,8 @@ class Prediction:
     """[B, N, 1, H, W] logit of the sky, of networks that tell it."""
     log_uncertainty: Tensor | None = None
     """[B, N, 1, H, W] logarithm of the expected error of log depth, of networks that tell it."""
+    novel: NovelViews | None = None
+    """What turned cameras would see, where it was asked for."""
 
     def first_sample(self) -> Prediction:
         """Return the output for the first sample, without its gradient."""
@@ -198,6 +210,8 @@ def evaluate_objective(
         terms = _self_supervised_terms(batch, prediction, config, identity_noise) if len(batch.contexts[0]) else {}
         if batch.truth is not None and config.truth > 0:
             terms |= _truth_terms(batch.truth, prediction, batch.truth_is_sparse)
+        if prediction.novel is not None:
+            terms |= _novel_terms(batch, prediction.depth, prediction.novel, config)
         return ObjectiveValue(per_sample=_weighted_total(terms, config).mean(dim=1), terms=terms)
 
 
@@ -221,6 +235,15 @@ def _self_supervised_terms(
         terms["pose_consistency"] = pose_consistency(seen, batch.anchor)
     if batch.recorded_motions is not None and config.recorded_motion > 0:
         terms["recorded_motion"] = motion_error(prediction.motions, batch.recorded_motions).mean(dim=1)
+    return terms
+
+
+def _novel_terms(batch: RigBatch, depth: Tensor, novel: NovelViews, config: ObjectiveConfig) -> dict[str, Tensor]:
+    terms = {}
+    if config.synthesis_consistency > 0:
+        terms["synthesis_consistency"] = consistency_of_views(batch, depth, novel, config.corrected)
+    if config.synthesis_smoothness > 0:
+        terms["synthesis_smoothness"] = smoothness_of_views(novel.disparity)
     return terms
 
 

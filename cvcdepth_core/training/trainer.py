@@ -33,6 +33,7 @@ from cvcdepth_core.training.batch import RigBatch
 from cvcdepth_core.training.config import AugmentationConfig, OptimizerConfig, TrainingConfig
 from cvcdepth_core.training.distributed import SINGLE_PROCESS, Processes, share_batch_statistics
 from cvcdepth_core.training.model import SurroundModel
+from cvcdepth_core.training.novel_views import draw_turns
 from cvcdepth_core.training.objective import ObjectiveValue, Prediction, evaluate_objective
 from cvcdepth_core.training.run_folder import RunFolder, RunIdentity
 
@@ -364,13 +365,19 @@ class Trainer:
             batch = zoom_in(batch, config.augmentation.zoom, generators)
         seen, depth_flips, pose_flips = _augment(batch, config.augmentation, generators)
         with torch.autocast(self._device.type, torch.bfloat16, self.autocast == "bfloat16"):
-            prediction = self.model(batch, seen, depth_flips, pose_flips)
+            prediction = self.model(batch, seen, depth_flips, pose_flips, self._turns(batch, generators))
         value = evaluate_objective(batch, prediction, config.objective, _identity_noise(batch, generators))
         (part.weight * value.per_sample.sum()).backward()  # type: ignore[no-untyped-call]
         if part.first == 0 and (self.progress.step - 1) % config.pictures_every == 0:
             for observer in self._observers:
                 observer.on_pictures(self, batch.first_sample(), prediction.first_sample())
         return ObjectiveValue(value.per_sample.detach(), {name: term.detach() for name, term in value.terms.items()})
+
+    def _turns(self, batch: RigBatch, generators: Sequence[torch.Generator]) -> Tensor | None:
+        """Draw how far the cameras of novel views are turned, where there are any."""
+        if not self.config.objective.synthesises:
+            return None
+        return draw_turns(self.config.synthesis, batch.cameras, generators).to(batch.frames)
 
     def _means(
         self, parts: Sequence[_Part], values: Sequence[ObjectiveValue]

@@ -55,13 +55,15 @@ class RunSettings(OutputSettings, MissingCameraSettings, MatchingSettings, Model
 
     clouds: Literal["merged", "all", "none"] = "merged"
     """Clouds to store: the merged one, each camera's organised one too, or none."""
+    obstacles: bool = False
+    """Store the points of obstacles and of the ground, and the scan of the nearest obstacles, too."""
     confidence: bool = False
     """Store how sure depth is also where it is not refined; refined depth always has its confidence."""
 
     @property
-    def has_confidence(self) -> bool:
-        """Whether confidence is computed and stored."""
-        return self.confidence or self.needs_confidence or self.refine != "off"
+    def wants_confidence(self) -> bool:
+        """Whether confidence is computed and stored whatever becomes of depth."""
+        return self.confidence or self.needs_confidence
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -99,7 +101,7 @@ def execute(arguments: argparse.Namespace) -> None:
                 warn(ground.told)
         replay = SurroundReplay(recorded, settings, settings.min_cameras)
         with _trace(arguments.trace) as latencies:
-            depths = DepthReplay(replay, estimator, latencies, settings, settings.has_confidence)
+            depths = DepthReplay(replay, estimator, latencies, settings, settings.wants_confidence)
             outcome = _record(arguments, settings, replay, depths)
         result = {
             "version": package_version(),
@@ -149,7 +151,13 @@ def _record(
     with (
         _stoppable() as stop,
         DepthRecorder(
-            arguments.output, replay, settings, settings.clouds, window[0], settings.has_confidence
+            arguments.output,
+            replay,
+            settings,
+            settings.clouds,
+            window[0],
+            depths.refinement.is_active,
+            settings.obstacles,
         ) as recorder,
     ):
         sets = depths.sets(*window, recorder.handlers)

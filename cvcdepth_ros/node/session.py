@@ -26,6 +26,7 @@ from cvcdepth_ros.messages.conversion import stamp_ns
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
 from cvcdepth_ros.node.diagnostics import (
     camera_status,
+    ground_plane_status,
     ground_problem,
     ground_status,
     inference_status,
@@ -41,6 +42,7 @@ from cvcdepth_ros.node.rig_transforms import RigTransforms
 from cvcdepth_ros.node.subscriptions import CameraInputs, StaticTransformInput
 from cvcdepth_ros.settings import NodeParameters
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
+from cvcdepth_ros.surround_sets.output_messages import OutputLimits
 from cvcdepth_ros.surround_sets.refinement import RefinementStage
 from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet
 from cvcdepth_ros.surround_sets.synchronizer import SurroundSynchronizer
@@ -94,7 +96,12 @@ class SurroundSession:
             motion = MotionInput(node, layout.base_frame, parameters.odometry_topic)
             self._motion = opened.enter_context(closing(motion))
             self._refinement = RefinementStage(
-                parameters, motion.poses.poses_at, self._wants_confidence, self.latencies, parameters.publish_odometry
+                parameters,
+                motion.poses.poses_at,
+                self._wants_confidence,
+                self.latencies,
+                parameters.publish_odometry,
+                lambda: bool(motion.poses.topic),
             )
             self._pipeline = SurroundPipeline(
                 estimator,
@@ -132,7 +139,7 @@ class SurroundSession:
     def poll(self) -> None:
         """Subscribe image topics that have appeared, and follow how far the sets come. To be called regularly."""
         self._inputs.connect()
-        if self._refinement.is_active:
+        if self._refinement.needs_motion:
             self._motion.connect()
         if self._transforms is not None:
             self._transforms.poll()
@@ -226,6 +233,7 @@ class SurroundSession:
             model_status(self._estimator),
             *([ground_status(self._assembler.layout)] if self._estimator.spec.is_told_its_rig else []),
             *([overlap_status(self._overlaps)] if self._overlaps else []),
+            *([ground_plane_status(self._outputs.ground)] if self._outputs.ground else []),
             *([refinement_status(self._refinement, self._motion.poses)] if self._refinement.is_active else []),
         ]
 
@@ -286,7 +294,7 @@ class SurroundSession:
         frame_ids = {name: self._assembler.view_frame_id(name) or "" for name in published.rig.names}
         parameters = read_parameters(self._node)
         self._needs_confidence = parameters.needs_confidence
-        self._outputs.publish(published, frame_ids, parameters.cloud_limits)
+        self._outputs.publish(published, frame_ids, OutputLimits.of(parameters))
         newest = max(published.surround_set.times_ns.values())
         self._ages.record("age of newest image at publish (ROS time)", "", newest)
 

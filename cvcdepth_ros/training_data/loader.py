@@ -16,6 +16,8 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from cvcdepth_core.errors import RecordingError, RigError
+from cvcdepth_core.networks.registry import DepthModelSpec
+from cvcdepth_core.networks.volume import refuse_cameras_outside
 from cvcdepth_core.rig.ground import refuse_unlikely_ground
 from cvcdepth_core.training.batch import RigBatch
 from cvcdepth_core.training.config import RecordingsConfig, TrainingConfig
@@ -64,11 +66,11 @@ class RecordingBatches:
         """Find the samples; RecordingError names recording and values when there are none.
 
         `lidar` names the LiDARs' topics, of which truth is made (None: those of each recording). RigError names
-        recording and camera where the network is told a rig that cannot be right about the ground.
+        recording and camera where the network is told a rig that cannot be right about the ground, or where its volume
+        does not contain the camera.
         """
         _refuse_unrecorded_motion(indexes, config.recordings)
-        if config.depth.is_told_its_rig:
-            _refuse_unlikely_ground(indexes)
+        _refuse_impossible_rigs(indexes, config.depth)
         refuse_standstill(indexes, config.recordings)
         variants = [
             of_target
@@ -137,10 +139,14 @@ def _refuse_unrecorded_motion(indexes: Sequence[RecordingIndex], config: Recordi
             )
 
 
-def _refuse_unlikely_ground(indexes: Sequence[RecordingIndex]) -> None:
+def _refuse_impossible_rigs(indexes: Sequence[RecordingIndex], spec: DepthModelSpec) -> None:
     for index in indexes:
+        rig = index.layout.complete()
         try:
-            refuse_unlikely_ground(index.layout.complete())
+            if spec.is_told_its_rig:
+                refuse_unlikely_ground(rig)
+            if spec.volume is not None:
+                refuse_cameras_outside(spec.volume, rig.poses_above_ground, rig.names)
         except RigError as error:
             raise RigError(f"{index.path}: {error}") from error
 

@@ -45,6 +45,13 @@ class NetworkRig:
     pairs: tuple[tuple[int, int], ...]
     """(camera, neighbour)."""
 
+    @property
+    def poses_above_ground(self) -> NDArray[np.float64]:
+        """`base_T_camera` [N, 4, 4] with the ground at z = 0."""
+        poses: NDArray[np.float64] = self.base_T_camera.copy()
+        poses[:, 2, 3] -= self.ground_height
+        return poses
+
     @classmethod
     def from_index(cls, index: RecordingIndex, height: int, width: int) -> NetworkRig:
         """Prepare the rig of a recording; RigError names a mask that does not fit."""

@@ -11,6 +11,7 @@ from cvcdepth_core.errors import CheckpointError, ConfigError
 from cvcdepth_core.model_choices import checkpoint_path
 from cvcdepth_core.networks.checkpoint import Checkpoint, load_spec
 from cvcdepth_core.networks.registry import DepthModelSpec
+from cvcdepth_core.networks.volume import VolumeSpec
 from cvcdepth_core.training.config import TrainingConfig, load_training_config
 from cvcdepth_core.training.starting_model import build_surround_model
 
@@ -67,6 +68,46 @@ def test_ablation_files_change_what_their_row_says(name):
     assert config.depth == load_training_config(SHIPPED / "ddad_r18.yaml").depth
 
 
+VERSATILITY = {  # pose method, DDCL, MVRCL, flip: the rows of the paper's last table, and one of ours
+    "vfdepth": ("volume", False, False, "none"),
+    "vfdepth_front_pose": ("front", False, False, "none"),
+    "vfdepth_ddcl": ("volume", True, False, "none"),
+    "vfdepth_mvrcl": ("volume", False, True, "none"),
+    "vfdepth_all": ("front", True, True, "none"),
+    "vfdepth_all_flips": ("front", True, True, "both"),
+}
+
+
+def test_there_is_one_file_per_row_of_the_versatility_table():
+    assert {path.stem for path in (SHIPPED / "versatility").iterdir()} == set(VERSATILITY)
+
+
+@pytest.mark.parametrize("name", VERSATILITY)
+def test_versatility_files_change_what_their_row_says(name):
+    config = load_training_config(SHIPPED / "versatility" / f"{name}.yaml")
+    loss = config.objective
+    row = (
+        config.pose.method,
+        loss.depth_consistency > 0,
+        loss.reconstruction_consistency > 0,
+        config.augmentation.flip,
+    )
+    assert row == VERSATILITY[name]
+    assert (loss.smoothness, loss.synthesis_consistency, loss.synthesis_smoothness) == (0.001, 0.03, 0.05)
+    assert (config.depth.network, config.depth.volume, config.synthesis.radians) == ("vfdepth", VolumeSpec(), True)
+
+
+def test_depth_synthesis_without_a_volume_or_with_skips_is_refused_with_the_weights(tmp_path):
+    fields = "objective: {synthesis_consistency: 0.03}\ndepth: {height: 64, width: 64, min_depth: 1, max_depth: 9"
+    for more, reason in (
+        ("}", "but depth.network is per_camera, expected vfdepth"),
+        (", network: vfdepth, volume: {skips: true}}", "whose skips show a turned camera another one's picture"),
+    ):
+        (tmp_path / "here.yaml").write_text(fields + more)
+        with pytest.raises(ConfigError, match=f"synthesis_consistency is 0.03 .*{reason}"):
+            load_training_config(tmp_path / "here.yaml")
+
+
 def sections(model: type[BaseModel]) -> Iterator[type[BaseModel]]:
     yield model
     for field in model.model_fields.values():
@@ -92,7 +133,7 @@ def test_every_field_of_the_configuration_is_described():
             r"objective.spatail is no known field; expected one of smoothness, spatial",
         ),
         (DEPTH + "nonsense: 1", r"nonsense is no known field; expected one of dataset, depth"),
-        (DEPTH + "pose: {method: abc}", r"pose.method is 'abc'.*'front', 'joint_front', 'joint' or 'per_camera'"),
+        (DEPTH + "pose: {method: abc}", r"pose.method is 'abc'.*'front', 'joint_front', 'joint', 'per_camera' or"),
         (DEPTH + "objective: {depth_warping: splat}", r"objective.depth_warping is 'splat'.*'ddcl' or 'dcl'"),
         (DEPTH + "seed: hello", r"seed is 'hello'.*integer"),
         (DEPTH + "objective: {spatial: -1}", r"objective.spatial is -1.*greater than or equal to 0"),
