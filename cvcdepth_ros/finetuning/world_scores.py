@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from cvcdepth_core.networks.checkpoint import load_checkpoint
+from cvcdepth_core.networks.registry import RIG_CONDITIONED
 from cvcdepth_core.scoring.comparison import Comparison, Difference, SetValues, compare_values
 from cvcdepth_core.scoring.metrics import METRIC_NAMES, SUMS, metrics_of, sum_errors
 from cvcdepth_core.training.config import TrainingConfig
@@ -21,6 +22,9 @@ from cvcdepth_core.training.model import SurroundModel
 from cvcdepth_core.training.starting_model import build_surround_model
 from cvcdepth_ros.training_data.world_views import ViewReader, batch_of_views
 
+NOT_TOLD = (
+    f"depth.network is not {RIG_CONDITIONED}: a network that is not told its rig learns no rig's scale from worlds"
+)
 _MIN_DEPTH = 0.5  # metres, of scores
 _TOGETHER = 8  # views that are scored at a time
 _DECIDING = "delta_1"
