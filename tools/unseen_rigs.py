@@ -6,7 +6,8 @@
 Simulated drives (`simulate --truth all`) are scored by their depth, the street by its LiDAR: as they are; the street
 shown by other rigs (views of the same pictures, with calibration and poses that fit them); and with a network that is
 told its rig wrongly, or sees other weather, while truth stays where it is. One process and one thread; `rows.jsonl`
-keeps what is done, so that the same command goes on where it was killed.
+keeps what is done, so that the same command goes on where it was killed. Of the first set of each there is a picture:
+the cameras, the network's depth, the truth; red is 1 m, dark blue 80.
 """
 
 from __future__ import annotations
@@ -29,13 +30,14 @@ from cvcdepth_core.errors import CvcDepthError
 from cvcdepth_core.estimator import DepthEstimator, SurroundDepthEstimator
 from cvcdepth_core.model_choices import checkpoint_path
 from cvcdepth_core.rig.rig_file import CameraEntry, PoseEntry, RigLayout, load_rig_layout
-from cvcdepth_core.rig.view import Aspect
+from cvcdepth_core.rig.view import Aspect, PicturePart
 from cvcdepth_core.scoring.ground_truth import sample_prediction
 from cvcdepth_core.scoring.metrics import median_ratio, sum_errors
 from cvcdepth_core.scoring.references import best_constant
 from cvcdepth_core.scoring.scorer import DepthSamples
 from cvcdepth_core.scoring.sparse_depth import SparseDepth
 from cvcdepth_core.surround_depth import SurroundPictures
+from cvcdepth_core.visualization import DepthScale
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings
 from cvcdepth_ros.evaluation.measuring import MeasuredSet, RecordingEvaluation
@@ -104,6 +106,7 @@ class Rows:
 
     def __init__(self, path: Path, weights: str) -> None:
         self._path, self._weights = path, weights
+        self.folder = path.parent
         lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
         self.rows: list[Row] = [row for row in map(json.loads, lines) if row["weights"] == weights]
 
@@ -127,21 +130,25 @@ def score_source(source: Source, estimator: DepthEstimator, kept: Rows) -> None:
     if told or not kept.has(source.name, source.kind, AS_IT_IS):
         scene = read(source, estimator)
         if not kept.has(source.name, source.kind, AS_IT_IS):
+            draw(scene, kept.folder / f"{source.name}.jpg")
             kept.add(source.name, source.kind, AS_IT_IS, scored(scene, estimator, unchanged))
         for case in told:
             kept.add(source.name, TOLD, case, scored(scene, estimator, CHANGES[case]))
     for case, shown in SHOWN_BY.items() if source.kind == STREET else ():
         if not kept.has(source.name, SHOWN, case):
-            kept.add(source.name, SHOWN, case, scored_as_shown(source, estimator, shown))
+            picture = kept.folder / f"{source.name}_{list(SHOWN_BY).index(case) + 1}.jpg"
+            kept.add(source.name, SHOWN, case, scored_as_shown(source, estimator, shown, picture))
 
 
-def scored_as_shown(source: Source, estimator: DepthEstimator, shown: Shown) -> Row:
+def scored_as_shown(source: Source, estimator: DepthEstimator, shown: Shown, picture: Path) -> Row:
     """Score the recording as another rig shows it, or say why the rig is refused."""
     with open_recording(source.path) as recording:
         layout = RecordedRig.from_recording(recording, source.layout).completed().layout
     other = source._replace(layout=shown_by(layout, shown))
     try:
-        return scored(read(other, estimator), estimator, unchanged)
+        scene = read(other, estimator)
+        draw(scene, picture)
+        return scored(scene, estimator, unchanged)
     except CvcDepthError as error:
         return {"refused": str(error)}
 
@@ -229,6 +236,29 @@ def joined(images: dict[str, list[Row]], sky: NDArray[np.int64]) -> Row:
 def median_of(rows: Sequence[Row], key: str) -> float:
     """Return the median of a column."""
     return float(np.median([row[key] for row in rows]))
+
+
+def draw(scene: Scene, path: Path) -> None:
+    """Write the cameras' pictures of the first set, the network's depth and the truth."""
+    measured = scene.sets[0]
+    result = measured.estimated.result
+    truth = [near_points(*each, *result.depth.shape[1:]) for each in zip(measured.truth, measured.parts, strict=True)]
+    scale = DepthScale()
+    rows = [result.pictures, scale.colours(result.depth), scale.colours(np.stack(truth))]
+    sheet = np.concatenate([np.concatenate(list(row), axis=1) for row in rows])
+    cv2.imwrite(str(path), sheet[..., ::-1])
+
+
+def near_points(truth: SparseDepth, part: PicturePart, height: int, width: int) -> NDArray[np.float32]:
+    """Return truth [H, W] in the network's picture: the nearest of the points in and beside each pixel."""
+    rows = np.floor((truth.rows + 0.5 - part.top) * height / part.height).astype(np.int64)
+    columns = np.floor((truth.columns + 0.5 - part.left) * width / part.width).astype(np.int64)
+    inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+    nearness = np.zeros((height, width), np.float32)
+    np.maximum.at(nearness, (rows[inside], columns[inside]), (1 / truth.depth[inside]).astype(np.float32))
+    grown = cv2.dilate(nearness, np.ones((3, 3), np.uint8))
+    with np.errstate(divide="ignore"):
+        return np.where(grown > 0, 1 / grown, np.nan).astype(np.float32)
 
 
 # What the network is told, or sees.
