@@ -31,10 +31,11 @@ from cvcdepth_core.estimator import DepthEstimator, SurroundDepthEstimator
 from cvcdepth_core.model_choices import checkpoint_path
 from cvcdepth_core.rig.rig_file import CameraEntry, PoseEntry, RigLayout, load_rig_layout
 from cvcdepth_core.rig.view import Aspect, PicturePart
-from cvcdepth_core.scoring.ground_truth import sample_prediction
 from cvcdepth_core.scoring.metrics import median_ratio, sum_errors
+from cvcdepth_core.scoring.obstacles import ObstacleScorer, ObstacleScores
 from cvcdepth_core.scoring.references import best_constant
 from cvcdepth_core.scoring.scorer import DepthSamples
+from cvcdepth_core.scoring.sky import SkyCounts
 from cvcdepth_core.scoring.sparse_depth import SparseDepth
 from cvcdepth_core.surround_depth import SurroundPictures
 from cvcdepth_core.visualization import DepthScale
@@ -167,21 +168,28 @@ def read(source: Source, estimator: DepthEstimator) -> Scene:
 def scored(scene: Scene, estimator: DepthEstimator, change: Change) -> Row:
     """Score the network on every set after a change: means over images, then over cameras."""
     images: dict[str, list[Row]] = {name: [] for name in scene.cameras}
-    sky = np.zeros(3, np.int64)
-    for number, measured in enumerate(scene.sets):
-        result = measured.estimated.result
-        pictures = SurroundPictures(
-            result.pictures, result.present, result.intrinsics, scene.base_T_camera, scene.valid
-        )
-        found = estimator.details(change(pictures, np.random.default_rng(number)))
-        known = scene.valid & result.present[:, None, None]
-        depth = np.where(known, found.depth, np.float32(np.nan))
-        estimated = replace(measured.estimated, result=replace(result, depth=depth))
-        for name, samples in zip(scene.cameras, replace(measured, estimated=estimated).samples(), strict=True):
+    sky, obstacles = SkyCounts(), ObstacleScorer()
+    for number, known in enumerate(scene.sets):
+        measured = estimated_anew(known, scene, estimator, change, np.random.default_rng(number))
+        for name, samples in zip(scene.cameras, measured.samples(), strict=True):
             images[name] += image_scores(samples)
-        if found.sky is not None:
-            sky += sky_counts(measured, np.where(known, found.sky, np.float32(np.nan)))
-    return joined(images, sky)
+        sky += measured.sky(MAX_DEPTH)
+        estimated = measured.estimated
+        obstacles.add(estimated.result, estimated.rig, measured.truth, None, measured.stamp_ns)
+    return joined(images, sky, obstacles.scores())
+
+
+def estimated_anew(
+    measured: MeasuredSet, scene: Scene, estimator: DepthEstimator, change: Change, random: np.random.Generator
+) -> MeasuredSet:
+    """Return the set with the network's depth after a change; its truth stays."""
+    result = measured.estimated.result
+    shown = SurroundPictures(result.pictures, result.present, result.intrinsics, scene.base_T_camera, scene.valid)
+    changed = change(shown, random)
+    found = estimator.estimate(changed)
+    known = scene.valid & result.present[:, None, None]
+    depth, sky = np.where(known, found, np.float32(np.nan)), estimator.sky(changed, found) & known
+    return replace(measured, estimated=replace(measured.estimated, result=replace(result, depth=depth, sky=sky)))
 
 
 def image_scores(samples: DepthSamples) -> list[Row]:
@@ -202,19 +210,7 @@ def image_scores(samples: DepthSamples) -> list[Row]:
     ]
 
 
-def sky_counts(measured: MeasuredSet, sky: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Return how many pixels with truth show the sky and are told as sky, either, and all (dense truth only)."""
-    counts = np.zeros(3, np.int64)
-    for truth, told, part in zip(measured.truth, sky, measured.parts, strict=True):
-        rows, columns = truth.sky.T
-        at_sky = SparseDepth(rows, columns, np.zeros(len(rows)), truth.height, truth.width)
-        there, elsewhere = (sample_prediction(told, pixels, part) for pixels in (at_sky, truth))
-        hit, false = int((there > 0.5).sum()), int((elsewhere > 0.5).sum())
-        counts += (hit, int((~np.isnan(there)).sum()) + false, int((~np.isnan(there)).sum()))
-    return counts
-
-
-def joined(images: dict[str, list[Row]], sky: NDArray[np.int64]) -> Row:
+def joined(images: dict[str, list[Row]], sky: SkyCounts, obstacles: ObstacleScores) -> Row:
     """Return one row of all cameras."""
     cameras = {
         name: {key: mean(row[key] for row in rows) for key in rows[0]} | {"scale": median_of(rows, "scale")}
@@ -228,7 +224,9 @@ def joined(images: dict[str, list[Row]], sky: NDArray[np.int64]) -> Row:
         "scale": geometric_mean(row["scale"] for row in cameras.values()),
         "worst": [worst, cameras[worst]["abs_rel"]],
         "better": [sum(row["abs_rel"] < row["constant"] for row in cameras.values()), len(cameras)],
-        "sky_iou": float(sky[0] / sky[1]) if sky[2] else None,
+        "sky_iou": sky.iou,
+        "recall": float(obstacles.recall()[0, -1]),
+        "precision": float(obstacles.precision()[0, -1]),
         "images": sum(map(len, images.values())),
     }
 
@@ -412,6 +410,7 @@ TITLES = (
     "best constant",
     "cameras better",
     "sky IoU",
+    "obstacles within 20 m: recall / precision",
 )
 
 
@@ -448,6 +447,7 @@ def mean_row(rows: Sequence[Row]) -> Row:
         "worst": max((row["worst"] for row in rows), key=lambda worst: worst[1]),
         "better": [sum(row["better"][i] for row in rows) for i in range(2)],
         "sky_iou": mean(told) if told else None,
+        **{key: mean(row[key] for row in rows) for key in ("recall", "precision")},
     }
 
 
@@ -460,12 +460,13 @@ def table(title: str, rows: Sequence[tuple[str, Row]]) -> str:
 def cells(row: Row) -> list[str]:
     """Return what stands below the titles."""
     if "refused" in row:
-        return [f"refused: {row['refused']}", *[""] * (len(TITLES) - 1)]
+        return [f"refused: {row['refused'].partition(',')[0]}", *[""] * (len(TITLES) - 1)]
     camera, worst = row["worst"]
     better, cameras = row["better"]
     sky = "" if row["sky_iou"] is None else f"{row['sky_iou']:.2f}"
     numbers = [f"{row['abs_rel']:.3f}", f"{row['delta']:.2f}", f"{row['scale']:.2f}"]
-    return [*numbers, f"{camera} {worst:.3f}", f"{row['constant']:.3f}", f"{better} of {cameras}", sky]
+    obstacles = f"{row['recall']:.2f} / {row['precision']:.2f}"
+    return [*numbers, f"{camera} {worst:.3f}", f"{row['constant']:.3f}", f"{better} of {cameras}", sky, obstacles]
 
 
 def sources(options: argparse.Namespace) -> Iterator[Source]:
