@@ -231,7 +231,8 @@ def _self_supervised_terms(
     if "reconstruction_consistency" in terms:
         terms["reconstruction_consistency"] = terms["reconstruction_consistency"].mean(dim=1)
     if config.smoothness > 0:
-        shown = batch.masks if config.corrected or config.leave_out_sky else None
+        leaves_out_sky = config.leave_out_sky and prediction.sky is not None
+        shown = batch.masks if config.corrected or leaves_out_sky else None
         terms["smoothness"] = smoothness(prediction.disparity, batch.images, shown)
     if config.pose_consistency > 0:
         seen = motions_seen_from_anchor(prediction.motions, batch.base_T_camera, batch.anchor)
