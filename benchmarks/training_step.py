@@ -10,7 +10,7 @@
 one writes it at first: one view after the other (camera_loop.py), plain Adam, the allocator as it comes. "networks" and
 "objective" are the parts of our step. `--against` names checkouts of other commits, whose trainers make steps too.
 
-`GOMP_SPINCOUNT=100000` in the environment lets idle threads spin, which `finetune` does not.
+Idle threads wait as those of `finetune` do; `GOMP_SPINCOUNT` in the environment has them spin longer, or not at all.
 
 Every measurement has a process of its own, for the peak memory is its; cases take turns. Depth begins at 10 m: with the
 1 to 2 m of random weights, neighbouring cameras would have nothing in common.
@@ -105,12 +105,13 @@ def compared(size: str, options: argparse.Namespace) -> Iterator[dict[str, Any]]
 
 def measured_there(case: str, checkout: Path, size: str, options: argparse.Namespace) -> dict[str, float]:
     """Measure in a process of its own, with the packages of a checkout."""
+    from cvcdepth_ros.process_setup import openmp_environment  # not where an older checkout's packages are measured
+
     passed = ("device", "samples", "encoder", "pose_method", "threads")
     arguments = [f"--{name.replace('_', '-')}={getattr(options, name)}" for name in passed]
     finished = subprocess.run(
         [sys.executable, __file__, f"--case={case}", f"--sizes={size}", *arguments],
-        env={"GOMP_SPINCOUNT": "0"}
-        | os.environ
+        env={**os.environ, **openmp_environment()}
         | {"PYTHONPATH": str(checkout), "OMP_NUM_THREADS": str(options.threads)},
         stdout=subprocess.PIPE,
         check=True,

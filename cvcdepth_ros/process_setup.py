@@ -15,6 +15,8 @@ from cvcdepth_ros.installation import share_directory
 _MALLOC_OPTIONS = {"MALLOC_MMAP_THRESHOLD_": -3, "MALLOC_TRIM_THRESHOLD_": -1, "MALLOC_ARENA_MAX": -8}
 """Of glibc: environment variable (mallopt(3)) and its number in malloc.h."""
 _WAITING_VARIABLES = ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY")
+_SPINS = "3000"
+"""Checks of a thread that waits, a few microseconds each at most, before it sleeps."""
 _PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 
 
@@ -30,12 +32,13 @@ _OF_FEATURE_MAPS = _Kept(1 << 30, (2 << 30) - 1)  # 2 GiB would not fit mallopt'
 
 
 def openmp_environment(environment: Mapping[str, str] = os.environ) -> dict[str, str]:
-    """Return what to add to `environment`, before torch is loaded, so that idle threads sleep.
+    """Return what to add to `environment`, before torch is loaded, so that idle threads soon sleep.
 
-    GNU's OpenMP, which torch brings, has them spin. Where something else uses the processors, the thread that all wait
-    for then waits itself for those that spin: a training step of 1.5 s took 31 s on two threads beside other work.
+    GNU's OpenMP, which torch brings, has them spin for long. Where something else uses the processors, the thread that
+    all wait for then waits itself for those that spin: a training step of 1.5 s took 31 s on two threads beside other
+    work. Not to spin at all costs a quarter of a step on a quiet machine.
     """
-    return {} if any(name in environment for name in _WAITING_VARIABLES) else {"GOMP_SPINCOUNT": "0"}
+    return {} if any(name in environment for name in _WAITING_VARIABLES) else {"GOMP_SPINCOUNT": _SPINS}
 
 
 def prepare_process() -> None:

@@ -55,6 +55,8 @@ class RunSettings(OutputSettings, MissingCameraSettings, MatchingSettings, Model
 
     clouds: Literal["merged", "all", "none"] = "merged"
     """Clouds to store: the merged one, each camera's organised one too, or none."""
+    obstacles: bool = False
+    """Store the points of obstacles and of the ground, and the scan of the nearest obstacles, too."""
     confidence: bool = False
     """Store how sure depth is also where it is not refined; refined depth always has its confidence."""
 
@@ -149,7 +151,13 @@ def _record(
     with (
         _stoppable() as stop,
         DepthRecorder(
-            arguments.output, replay, settings, settings.clouds, window[0], settings.has_confidence
+            arguments.output,
+            replay,
+            settings,
+            settings.clouds,
+            window[0],
+            settings.has_confidence,
+            settings.obstacles,
         ) as recorder,
     ):
         sets = depths.sets(*window, recorder.handlers)

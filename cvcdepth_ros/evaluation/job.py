@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 
 from cvcdepth_core.model_choices import FlipFusion
 from cvcdepth_ros.installation import package_version
-from cvcdepth_ros.settings import LIDAR_TOLERANCE, MatchingSettings, ModelSettings
+from cvcdepth_ros.settings import LIDAR_TOLERANCE, MatchingSettings, ModelSettings, SkySettings
 
 if TYPE_CHECKING:
     from cvcdepth_core.estimator import DepthPredictor
@@ -32,7 +32,7 @@ class Dependencies(NamedTuple):
     """Hash of the checkpoint's bytes; None without one."""
 
 
-class EvaluationSettings(MatchingSettings, ModelSettings):
+class EvaluationSettings(SkySettings, MatchingSettings, ModelSettings):
     """Everything that decides the scores of a given recording, beside the rig and the part that is taken."""
 
     predictor: Literal["constant", "ground_plane"] | None = None

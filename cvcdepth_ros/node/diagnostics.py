@@ -8,6 +8,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from cvcdepth_core.estimator import DepthEstimator
+from cvcdepth_core.obstacles.ground import GroundPlane
 from cvcdepth_core.rig.ground import is_on_ground, unstated_ground
 from cvcdepth_core.rig.rig_file import RigLayout
 from cvcdepth_core.rig_health.overlap_monitor import OverlapMonitor
@@ -141,6 +142,12 @@ def refinement_status(stage: RefinementStage, motion: VehiclePoses) -> Diagnosti
         values[f"{name}: neighbours"] = int(beside)
     problem = refined.odometry_problem or motion.problem
     return status(WARN if problem else OK, "refinement", problem or _EVIDENCE[refined.source], values)
+
+
+def ground_plane_status(ground: GroundPlane) -> DiagnosticStatus:
+    """Return where the ground was taken to be in the last set whose obstacles were asked for."""
+    values = {"height (m)": ground.height, "slope along x": ground.slope_x, "slope along y": ground.slope_y}
+    return status(OK if ground.is_fitted else WARN, "ground plane", ground.describe(), values)
 
 
 def _text(value: Any) -> str:

@@ -26,6 +26,7 @@ from cvcdepth_ros.messages.conversion import stamp_ns
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
 from cvcdepth_ros.node.diagnostics import (
     camera_status,
+    ground_plane_status,
     ground_problem,
     ground_status,
     inference_status,
@@ -41,6 +42,7 @@ from cvcdepth_ros.node.rig_transforms import RigTransforms
 from cvcdepth_ros.node.subscriptions import CameraInputs, StaticTransformInput
 from cvcdepth_ros.settings import NodeParameters
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
+from cvcdepth_ros.surround_sets.output_messages import OutputLimits
 from cvcdepth_ros.surround_sets.refinement import RefinementStage
 from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet
 from cvcdepth_ros.surround_sets.synchronizer import SurroundSynchronizer
@@ -226,6 +228,7 @@ class SurroundSession:
             model_status(self._estimator),
             *([ground_status(self._assembler.layout)] if self._estimator.spec.is_told_its_rig else []),
             *([overlap_status(self._overlaps)] if self._overlaps else []),
+            *([ground_plane_status(self._outputs.ground)] if self._outputs.ground else []),
             *([refinement_status(self._refinement, self._motion.poses)] if self._refinement.is_active else []),
         ]
 
@@ -286,7 +289,7 @@ class SurroundSession:
         frame_ids = {name: self._assembler.view_frame_id(name) or "" for name in published.rig.names}
         parameters = read_parameters(self._node)
         self._needs_confidence = parameters.needs_confidence
-        self._outputs.publish(published, frame_ids, parameters.cloud_limits)
+        self._outputs.publish(published, frame_ids, OutputLimits.of(parameters))
         newest = max(published.surround_set.times_ns.values())
         self._ages.record("age of newest image at publish (ROS time)", "", newest)
 

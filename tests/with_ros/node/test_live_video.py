@@ -88,7 +88,7 @@ def test_cameras_that_send_video_get_depth_from_their_next_key_frame_on(graph: R
     graph.subscribe(Image, *DEPTH.values())
     graph.start_node(rig=rig, untrained=True, height=64, width=96, max_age=0.0, reliable=True)
     graph.await_subscribers([*TOPICS.values()])
-    cameras.run_until(lambda: graph.received[CLOUD], "a cloud")
+    cameras.run_until(lambda: all(graph.received[topic] for topic in (CLOUD, *DEPTH.values())), "cloud and depth")
     for name in CAMERAS:
         depth = np.frombuffer(graph.received[DEPTH[name]][0].data, np.float32)
         assert np.isfinite(depth).any(), name
