@@ -96,7 +96,12 @@ class SurroundSession:
             motion = MotionInput(node, layout.base_frame, parameters.odometry_topic)
             self._motion = opened.enter_context(closing(motion))
             self._refinement = RefinementStage(
-                parameters, motion.poses.poses_at, self._wants_confidence, self.latencies, parameters.publish_odometry
+                parameters,
+                motion.poses.poses_at,
+                self._wants_confidence,
+                self.latencies,
+                parameters.publish_odometry,
+                lambda: bool(motion.poses.topic),
             )
             self._pipeline = SurroundPipeline(
                 estimator,
@@ -134,7 +139,7 @@ class SurroundSession:
     def poll(self) -> None:
         """Subscribe image topics that have appeared, and follow how far the sets come. To be called regularly."""
         self._inputs.connect()
-        if self._refinement.is_active:
+        if self._refinement.needs_motion:
             self._motion.connect()
         if self._transforms is not None:
             self._transforms.poll()
