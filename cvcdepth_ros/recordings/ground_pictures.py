@@ -91,10 +91,11 @@ class _Road:
 
     def views(self, pair: _Moment) -> Iterator[tuple[RoadView, RoadView]]:
         """Yield pairs of pictures with their places: each camera's along the way, and neighbours' at once."""
-        if pair.second is not None:
-            yield from self._along_the_way(pair.first, pair.second)
-        elif pair.first is not None:
-            yield from self._between_neighbours(pair.first.found)
+        first, second = pair
+        if first is not None and second is not None:
+            yield from self._along_the_way(first, second)
+        elif first is not None:
+            yield from self._between_neighbours(first.found)
 
     def _along_the_way(self, first: _PlacedSet, second: _PlacedSet) -> Iterator[tuple[RoadView, RoadView]]:
         """Yield both pictures of each camera that has them, in the base frame at its first exposure."""
