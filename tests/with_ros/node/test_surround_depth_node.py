@@ -132,6 +132,7 @@ def test_a_stranger_rebuilds_the_organised_cloud_from_depth_and_camera_info(grap
         assert size == (depth.height, depth.width) == (cloud.height, cloud.width) == (picture.height, picture.width)
 
         metres = np.frombuffer(depth.data, np.float32).reshape(size)
+        metres = np.where(np.isfinite(metres), metres, np.nan)  # the sky is inf
         points = np.frombuffer(cloud.data, np.float32).reshape(*size, cloud.point_step // 4)
         fx, _, cx, _, _, fy, cy, *_ = info.p
         v, u = np.mgrid[: info.height, : info.width]
