@@ -7,8 +7,9 @@ Each engine has a process of its own, whose peak memory it is, and they take tur
 6 x 384 x 640 as torch runs it: all cameras as one batch, operation by operation, float32. `times_eager` compares with
 the same for the same network and size. The engines run in processes set up like those of node and bag tool, which keep
 freed buffers (`prepare_process`); "buffers kept" is the baseline in such a process. Weights are random: they change
-nothing about the speed. `gflop_per_cpu_s` is the work of the network as it was trained over the CPU time of all
-threads, `of_matrix_product` its ratio to what a thread reaches with large matrices, the limit of a core.
+nothing about the speed. A network is named by the encoder of the published one, or `rig_conditioned`. `gflop_per_cpu_s`
+is the work of the network as it was trained over the CPU time of all threads, `of_matrix_product` its ratio to what a
+thread reaches with large matrices, the limit of a core.
 """
 
 from __future__ import annotations
@@ -58,16 +59,30 @@ def parse_options() -> argparse.Namespace:
         "--networks",
         type=network_of,
         nargs="+",
-        default=[("resnet18", 384, 640), ("efficientnet_lite0", 192, 320), ("efficientnet_lite0", 384, 640)],
-        metavar="ENCODER:HxW",
+        default=[
+            ("resnet18", 384, 640),
+            ("rig_conditioned", 160, 256),
+            ("efficientnet_lite0", 192, 320),
+            ("efficientnet_lite0", 384, 640),
+        ],
+        metavar="NETWORK:HxW",
     )
     return parser.parse_args()
 
 
 def network_of(text: str) -> tuple[str, int, int]:
-    encoder, _, size = text.partition(":")
+    name, _, size = text.partition(":")
     height, _, width = size.partition("x")
-    return encoder, int(height), int(width)
+    return name, int(height), int(width)
+
+
+def spec_of(network: tuple[str, int, int]) -> DepthModelSpec:
+    """Return what the network is for; the depth range changes nothing about its speed."""
+    from cvcdepth_core.networks.registry import RIG_CONDITIONED, DepthModelSpec
+
+    name, height, width = network
+    kind = {"network": name, "encoder": "efficientnet_lite0"} if name == RIG_CONDITIONED else {"encoder": name}
+    return DepthModelSpec(height=height, width=width, min_depth=0.5, max_depth=100.0, **kind)  # type: ignore[arg-type]
 
 
 def measured(network: tuple[str, int, int], options: argparse.Namespace) -> Iterator[dict[str, Any]]:
@@ -121,20 +136,21 @@ def floating_point_operations(network: tuple[str, int, int]) -> float:
     import torch
     from torch import nn
 
-    from cvcdepth_core.networks import DepthNet
+    from cvcdepth_core.engines.example_rigs import ring_of_cameras
+    from cvcdepth_core.networks import build_depth_network
 
-    encoder, height, width = network
+    spec = spec_of(network)
     done: list[float] = []
 
     def count(layer: nn.Module, _: object, output: torch.Tensor) -> None:
         done.append(2.0 * output.numel() * layer.weight[0].numel())  # type: ignore[operator,union-attr,index]
 
-    counted = DepthNet(encoder).eval()
+    counted = build_depth_network(spec).eval()
     for layer in counted.modules():
         if isinstance(layer, nn.Conv2d):
             layer.register_forward_hook(count)
     with torch.inference_mode():
-        counted.disparity(torch.zeros(1, 3, height, width))
+        counted(ring_of_cameras(spec.height, spec.width).of_cameras([0]))
     return CAMERAS * sum(done)
 
 
@@ -204,21 +220,12 @@ def work(connection: Connection, case: Case, device: str, threads: int) -> None:
 
 def estimate_of(case: Case, device: str) -> Callable[[], Depth]:
     """Return what is measured; pictures and weights are the same for every engine of a network."""
-    from cvcdepth_core.engines.example_rigs import street_like_picture
+    from cvcdepth_core.engines.example_rigs import ring_of_pictures
     from cvcdepth_core.estimator import DepthEstimator, untrained_network
-    from cvcdepth_core.networks.registry import DepthModelSpec
-    from cvcdepth_core.surround_depth import SurroundPictures
 
-    engine, encoder, height, width = case
-    spec = DepthModelSpec(encoder=encoder, height=height, width=width, min_depth=0.5, max_depth=100.0)
-    pictures = [np.roll(street_like_picture(height, width), 17 * camera, axis=1) for camera in range(CAMERAS)]
-    surround = SurroundPictures(
-        pictures=np.stack(pictures),
-        present=np.ones(CAMERAS, bool),
-        intrinsics=np.tile([[0.5 * width, 0, width / 2], [0, 0.5 * width, height / 2], [0, 0, 1]], (CAMERAS, 1, 1)),
-        base_T_camera=np.tile(np.eye(4), (CAMERAS, 1, 1)),
-        valid=np.ones((CAMERAS, height, width), bool),
-    )
+    engine, *network_and_size = case
+    spec = spec_of(tuple(network_and_size))
+    surround = ring_of_pictures(spec.height, spec.width)
     network = untrained_network(spec)
     if engine in (BASELINE[0], KEPT_BUFFERS):
         return straightforward(network, spec, surround, device)

@@ -50,7 +50,7 @@ def main() -> None:
 
 def parse_options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--encoder", default="efficientnet_lite0", help="the default one is the default model's")
+    parser.add_argument("--encoder", default="efficientnet_lite0", help="of a network with random weights")
     parser.add_argument("--height", type=int, default=192)
     parser.add_argument("--width", type=int, default=320)
     parser.add_argument("--seconds", type=float, default=20.0)

@@ -3,7 +3,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from cvcdepth_core.networks import DepthNetwork, build_depth_network, disparity_
 from cvcdepth_core.networks.checkpoint import load_checkpoint
 from cvcdepth_core.networks.mirroring import fuse_with_mirrored, mirrored_pictures
 from cvcdepth_core.networks.registry import DepthModelSpec
+from cvcdepth_core.networks.volume import refuse_cameras_outside
 from cvcdepth_core.rig.ground import refuse_unlikely_ground
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.sky import beyond_measure, sky_in_pictures
@@ -54,6 +55,17 @@ class DepthPredictor(Protocol):
         """Return depth [N, H, W] in metres of one set; absent cameras' means nothing."""
 
 
+class PredictedDepth(NamedTuple):
+    """What a network says of the pictures of one set, [N, H, W] each; absent cameras' means nothing."""
+
+    depth: NDArray[np.float32]
+    """Metres along the optical axis."""
+    sky: NDArray[np.float32] | None = None
+    """Probability that the pixel shows the sky, whose depth is the farthest there is; None where it is not told."""
+    log_uncertainty: NDArray[np.float32] | None = None
+    """Natural logarithm of the error of log depth that is to be expected; None where it is not told."""
+
+
 class DepthEstimator:
     """A depth network, run by one of the engines."""
 
@@ -75,6 +87,7 @@ class DepthEstimator:
         self.spec = spec
         self.weights_id = weights_id
         self.flip_fusion = flip_fusion
+        self._mirror_offset = network.mirror_offset
         self._engine = build_engine(network, spec, device, backend, precision, cpu_fallback)
 
     @classmethod
@@ -112,17 +125,21 @@ class DepthEstimator:
         return self._engine.independent
 
     def estimate(self, surround: SurroundPictures) -> NDArray[np.float32]:
-        """Return depth [N, H, W] in metres of one set; absent cameras' means nothing.
+        """Return depth [N, H, W] in metres of one set; see `details`."""
+        return self.details(surround).depth
+
+    def details(self, surround: SurroundPictures) -> PredictedDepth:
+        """Return depth of one set and what else the network says.
 
         On a CPU an independent camera's depth does not depend on the others to the last bit. Raises EngineError when
         the device fails or has too little memory.
         """
         with torch.inference_mode():
-            depth = self._depth(surround)
+            found = self._predicted(surround)
             if self.flip_fusion != "none":
-                depth = fuse_with_mirrored(depth, self._depth(mirrored_pictures(surround)), self.flip_fusion)
-        metres: NDArray[np.float32] = depth[:, 0].numpy()
-        return metres
+                mirrored = mirrored_pictures(surround, self._mirror_offset)
+                found = found.fused(self._predicted(mirrored), self.flip_fusion)
+        return found.arrays()
 
     def sky(self, surround: SurroundPictures, depth: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Return where a set shows the sky [N, H, W], by its `depth` where the network knows the sky, else by looks."""
@@ -130,15 +147,44 @@ class DepthEstimator:
             return beyond_measure(depth, surround.fx, self.spec.max_depth, self.spec.focal_scale)
         return sky_in_pictures(surround, depth)
 
-    def _depth(self, surround: SurroundPictures) -> torch.Tensor:
-        """Return the network's depth [N, 1, H, W] in metres."""
-        return disparity_to_depth(
-            self._engine.disparity(surround),
+    def _predicted(self, surround: SurroundPictures) -> "_Predicted":
+        outputs = self._engine.details(surround)
+        depth = disparity_to_depth(
+            outputs.disparity,
             torch.as_tensor(surround.fx, dtype=torch.float32),
             self.spec.min_depth,
             self.spec.max_depth,
             self.spec.focal_scale,
         )
+        sky = None if outputs.sky is None else torch.sigmoid(outputs.sky)
+        return _Predicted(depth, sky, outputs.log_uncertainty)
+
+
+class _Predicted(NamedTuple):
+    """As `PredictedDepth`, [N, 1, H, W] each."""
+
+    depth: torch.Tensor
+    sky: torch.Tensor | None
+    log_uncertainty: torch.Tensor | None
+
+    def fused(self, mirrored: "_Predicted", fusion: FlipFusion) -> "_Predicted":
+        """Return both passes as one; beside depth, by the mean of both."""
+        depth = fuse_with_mirrored(self.depth, mirrored.depth, fusion)
+        others = (
+            None if one is None or other is None else fuse_with_mirrored(one, other, "depth")
+            for one, other in zip(self[1:], mirrored[1:], strict=True)
+        )
+        return _Predicted(depth, *others)
+
+    def arrays(self) -> PredictedDepth:
+        """Return them without the channel."""
+        sky, log_uncertainty = (None if part is None else part[:, 0].numpy() for part in self[1:])
+        return PredictedDepth(self.depth[:, 0].numpy(), sky, log_uncertainty)
+
+
+def is_told_its_rig(predictor: DepthPredictor) -> bool:
+    """Say whether its depth depends on where the rig's cameras are and look, and how high above the ground."""
+    return isinstance(predictor, DepthEstimator) and predictor.spec.is_told_its_rig
 
 
 def untrained_network(spec: DepthModelSpec, seed: int = 0) -> DepthNetwork:
@@ -157,10 +203,13 @@ class SurroundDepthEstimator:
     def __init__(self, rig: Rig, estimator: DepthPredictor, known: "SurroundDepthEstimator | None" = None) -> None:
         """Prepare the maps; those of `known` are taken over for the cameras that have not changed.
 
-        RigError names the camera where the network is told the rig, and the rig cannot be right about the ground.
+        RigError names the camera where the network is told the rig, and the rig cannot be right about the ground, or
+        where the network's volume does not contain it.
         """
-        if isinstance(estimator, DepthEstimator) and estimator.spec.is_told_its_rig:
+        if is_told_its_rig(estimator):
             refuse_unlikely_ground(rig)
+        if isinstance(estimator, DepthEstimator) and estimator.spec.volume is not None:
+            refuse_cameras_outside(estimator.spec.volume, rig.poses_above_ground, rig.names)
         self.rig = rig
         self.estimator = estimator
         self.preprocessor: SurroundPreprocessor = SurroundPreprocessor(

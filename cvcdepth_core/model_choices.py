@@ -25,10 +25,7 @@ FlipFusion = Literal["none", "depth", "inverse_depth"]
 DEFAULT = "default"
 """Name of the small model that comes with the package, in the place of a checkpoint's path."""
 
-NOTICE = (
-    "default model: trained on three seconds of one street, to try the software and to start training from, not for "
-    "driving"
-)
+NOTICE = "default model: small, to try the software and to start training from, not for driving"
 
 _PATH = Path(__file__).parent / "models" / "default.safetensors"
 

@@ -17,6 +17,7 @@ from cvcdepth_ros.commands import (
     finetune,
     import_weights,
     inspect,
+    networks,
     play,
     pretrain,
     rig,
@@ -59,6 +60,7 @@ COMMANDS: Mapping[str, Command] = {
     "export": export,
     "simulate": simulate,
     "pretrain": pretrain,
+    "networks": networks,
 }
 
 

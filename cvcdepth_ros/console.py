@@ -126,6 +126,14 @@ def non_negative(text: str) -> float:
     return number
 
 
+def share(text: str) -> float:
+    """Return the number from zero to below one that an option's text says; for argparse."""
+    number = non_negative(text)
+    if number >= 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a share, at least 0 and below 1")
+    return number
+
+
 def count(text: str) -> int:
     """Return the whole number of at least one that an option's text says; for argparse."""
     if not text.isdigit() or int(text) < 1:

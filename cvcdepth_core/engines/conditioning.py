@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -14,6 +15,29 @@ _KEPT = 32  # cameras; a rig that changes for ever does not fill the memory
 
 Made = tuple[Tensor, ...]
 """[M, ...] each, of M cameras."""
+
+
+Whole = TypeVar("Whole")
+
+
+class KeptForWholeRig(Generic[Whole]):
+    """What is made of a rig's calibration, masks and absent cameras together, of the one that was asked for last."""
+
+    def __init__(self, make: Callable[[RigImages], Whole]) -> None:
+        self._make = make
+        self._kept: tuple[RigImages, Whole] | None = None
+
+    @torch.inference_mode()
+    def __call__(self, rig: RigImages) -> Whole:
+        """Return what is made of the rig."""
+        if self._kept is None or not _differ_by_pictures_alone(self._kept[0], rig):
+            self._kept = RigImages(rig.images[:, :, :1].clone(), *(part.clone() for part in rig[1:])), self._make(rig)
+        return self._kept[1]
+
+
+def _differ_by_pictures_alone(one: RigImages, other: RigImages) -> bool:
+    same_size = one.images.shape[-2:] == other.images.shape[-2:]
+    return same_size and all(torch.equal(*parts) for parts in zip(one[1:], other[1:], strict=True))
 
 
 class KeptForRig:

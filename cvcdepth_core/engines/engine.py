@@ -2,13 +2,13 @@
 """What every inference engine offers."""
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
 from cvcdepth_core.errors import EngineError
-from cvcdepth_core.networks import DepthNetwork, RigImages
+from cvcdepth_core.networks import DepthNetwork, DepthOutputs, RigImages
 
 
 class DeviceMemoryError(EngineError):
@@ -50,3 +50,16 @@ class DisparityEngine(Protocol):
 
         Raises DeviceMemoryError, or torch's own error, when the device's memory is too small for so many cameras.
         """
+
+
+@runtime_checkable
+class DetailedEngine(DisparityEngine, Protocol):
+    """An engine that also gives what the network says beside disparity."""
+
+    def details(self, rig: RigImages) -> DepthOutputs:
+        """Return all outputs [B, N, 1, H, W] of a rig's images, of which `disparity` returns the first."""
+
+
+def details_of(engine: DisparityEngine, rig: RigImages) -> DepthOutputs:
+    """Return all that an engine gives for a rig's images, [B, N, 1, H, W]."""
+    return engine.details(rig) if isinstance(engine, DetailedEngine) else DepthOutputs(engine.disparity(rig))

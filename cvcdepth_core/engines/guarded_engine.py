@@ -3,16 +3,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cvcdepth_core.engines.engine import DeviceMemoryError, DisparityEngine
+from cvcdepth_core.engines.engine import DeviceMemoryError, DisparityEngine, details_of
 from cvcdepth_core.errors import EngineError
-from cvcdepth_core.networks import RigImages
+from cvcdepth_core.networks import DepthOutputs, RigImages
 from cvcdepth_core.surround_depth import SurroundPictures
 
 
@@ -47,7 +47,11 @@ class GuardedEngine:
         return self._engine.device
 
     def disparity(self, surround: SurroundPictures) -> Tensor:
-        """Return the disparity [N, 1, H, W] in (0, 1), float32 on the CPU; absent cameras' means nothing.
+        """Return the disparity [N, 1, H, W] in (0, 1); see `details`."""
+        return self.details(surround).disparity
+
+    def details(self, surround: SurroundPictures) -> DepthOutputs:
+        """Return all that the network says, [N, 1, H, W] each, float32 on the CPU; absent cameras' means nothing.
 
         A number of cameras that the memory did not hold is not tried again. Raises EngineError when the device fails
         or does not hold the least that the network can take, and there is no fallback.
@@ -69,12 +73,16 @@ class GuardedEngine:
             except (RuntimeError, EngineError) as error:  # torch's word for a lost GPU is a RuntimeError
                 self._replace("failed", error)
 
-    def _in_chunks(self, surround: SurroundPictures, cameras: NDArray[np.intp], chunk: int) -> Tensor:
-        disparity = torch.zeros(len(surround.present), 1, *surround.pictures.shape[1:3])
+    def _in_chunks(self, surround: SurroundPictures, cameras: NDArray[np.intp], chunk: int) -> DepthOutputs:
+        found = []
         for start in range(0, len(cameras), chunk):
-            part = cameras[start : start + chunk]
-            disparity[part] = self._engine.disparity(RigImages.from_pictures(surround, part, self.device))[0].cpu()
-        return disparity
+            rig = RigImages.from_pictures(surround, cameras[start : start + chunk], self.device)
+            found.append(details_of(self._engine, rig).map(lambda part: part[0].cpu()))
+        absent = torch.zeros(len(surround.present), 1, *surround.pictures.shape[1:3])
+        if not found:
+            return DepthOutputs(absent)
+        placed = torch.from_numpy(cameras)
+        return _joined(found).map(lambda part: absent.index_copy(0, placed, part))
 
     def _replace(self, what: str, error: Exception) -> None:
         if self._fallback is None:
@@ -82,3 +90,14 @@ class GuardedEngine:
             raise EngineError(f"{self.name} on {self.device}: {what}: {reason}") from error
         self._engine, self._fallback = self._fallback(), None
         self._chunk = self._engine.chunk
+
+
+def _joined(parts: Sequence[DepthOutputs]) -> DepthOutputs:
+    """Return the outputs of some cameras after those of others, [M, 1, H, W] each."""
+    sky, log_uncertainty = (_cat([part[kind] for part in parts]) for kind in (1, 2))
+    return DepthOutputs(torch.cat([part.disparity for part in parts]), sky, log_uncertainty)
+
+
+def _cat(parts: Sequence[Tensor | None]) -> Tensor | None:
+    there = [part for part in parts if part is not None]
+    return torch.cat(there) if there else None

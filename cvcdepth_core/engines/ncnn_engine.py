@@ -14,13 +14,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from cvcdepth_core.engines.conditioning import KeptForRig
 from cvcdepth_core.engines.engine import image_by_image
 from cvcdepth_core.engines.ncnn_graph import INPUT, OUTPUT, ncnn_model
 from cvcdepth_core.engines.rewriting import RewrittenDepthNet
-from cvcdepth_core.engines.rewriting_conditioned import RewrittenRigConditionedNet, ToldConstants
+from cvcdepth_core.engines.rewriting_conditioned import RewrittenRigConditionedNet, ToldDetails
 from cvcdepth_core.errors import EngineError
-from cvcdepth_core.networks import DepthNet, RigImages
+from cvcdepth_core.networks import DepthNet, DepthOutputs, RigImages
 from cvcdepth_core.networks.rig_conditioned import RigConditionedNet
 
 
@@ -96,18 +95,15 @@ class ConditionedNcnnEngine(NcnnEngine):
 
     def __init__(self, network: RigConditionedNet) -> None:
         super().__init__(network)
-        constants = ToldConstants(network)
-        self._network = network
-        self._told = KeptForRig(lambda rig: constants(network.conditioning(rig).flatten(0, 1)))
+        self._details = ToldDetails(network, self.device)
 
     def disparity(self, rig: RigImages) -> Tensor:
         """See `DisparityEngine`."""
-        *told, ground = self._told(rig)
-        inputs = dict(zip(ToldConstants.names, told, strict=True))
-        with torch.inference_mode():
-            return image_by_image(
-                lambda images: self._network.from_head(self._each({INPUT: images, **inputs}), ground).disparity, rig
-            )
+        return self.details(rig).disparity
+
+    def details(self, rig: RigImages) -> DepthOutputs:
+        """See `DetailedEngine`."""
+        return self._details(rig, self._each)
 
     def _graph(self, network: Any) -> nn.Module:
         return RewrittenRigConditionedNet(network)

@@ -9,7 +9,7 @@ import inspect
 import io
 import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +20,17 @@ from cvcdepth_core.engines.conditioning import KeptForRig, conditioning_of
 from cvcdepth_core.engines.engine import DeviceMemoryError, best_chunk, image_by_image
 from cvcdepth_core.engines.example_rigs import ring_of_cameras
 from cvcdepth_core.engines.rewriting import RewrittenDepthNet
+from cvcdepth_core.engines.rewriting_conditioned import RewrittenRigConditionedNet, ToldConstants
 from cvcdepth_core.errors import EngineError
 from cvcdepth_core.model_choices import Precision
-from cvcdepth_core.networks import ConditionedNetwork, DepthNet, DepthNetwork, RigImages
+from cvcdepth_core.networks import ConditionedNetwork, DepthNet, DepthNetwork, DepthOutputs, RigImages
 from cvcdepth_core.networks.registry import DepthModelSpec
+from cvcdepth_core.networks.rig_conditioned import RigConditionedNet
 
 INPUT, OUTPUT = "images", "disparity"
 CONDITIONING = "conditioning"
+DETAILS = DepthOutputs._fields
+"""The outputs of a network that is told its rig, `disparity` the first."""
 MOST_CAMERAS = 12
 """Images that a TensorRT engine takes at once."""
 
@@ -39,8 +43,9 @@ def onnx_model(network: DepthNetwork, spec: DepthModelSpec) -> bytes:
 
     The published network becomes `images` [B, 3, H, W] in [0, 1] to `disparity` [B, 1, H, W], of any B, H and W; H and
     W are multiples of 32, those of `spec` are what the network was trained for. A network that is told its rig takes
-    `conditioning` [B, C, H, W] too, which is made of each camera's calibration once. Any other one takes the fields of
-    `RigImages` by their names and gives `disparity` [1, N, 1, H, W], of any N, at the size of `spec`.
+    `conditioning` [B, C, H, W] too, which is made of each camera's calibration once, and gives all of `DepthOutputs` by
+    their names. Any other one takes the fields of `RigImages` by their names and gives `disparity` [1, N, 1, H, W], of
+    any N, at the size of `spec`.
     """
     if isinstance(network, DepthNet):
         images = {INPUT: torch.zeros(1, 3, spec.height, spec.width)}
@@ -50,8 +55,16 @@ def onnx_model(network: DepthNetwork, spec: DepthModelSpec) -> bytes:
         alone = rig.of_cameras([0])
         inputs = {INPUT: alone.images[0], CONDITIONING: network.conditioning(alone)[0]}
         axes = {0: "cameras", 2: "height", 3: "width"}
-        return _exported(_OnConditioning(copy.deepcopy(network).eval()), inputs, axes)
+        return _exported(_OnConditioning(copy.deepcopy(network).eval()), inputs, axes, DETAILS)
     return _exported(_OnTensors(copy.deepcopy(network).eval()), rig._asdict(), {1: "cameras"})
+
+
+def rewritten_onnx_model(network: RigConditionedNet, spec: DepthModelSpec) -> bytes:
+    """Return, as an ONNX model, what `RewrittenRigConditionedNet` takes by name to its head, which is the output."""
+    rig = ring_of_cameras(spec.height, spec.width).of_cameras([0])
+    *told, _ = ToldConstants(network)(network.conditioning(rig)[0])
+    inputs = {INPUT: rig.images[0], **dict(zip(ToldConstants.names, told, strict=True))}
+    return _exported(RewrittenRigConditionedNet(network), inputs, [0, 2, 3])
 
 
 class _OnTensors(nn.Module):
@@ -73,13 +86,19 @@ class _OnConditioning(nn.Module):
         super().__init__()
         self._network = network
 
-    def forward(self, images: Tensor, conditioning: Tensor) -> Tensor:
-        return self._network.disparity(images, conditioning)
+    def forward(self, images: Tensor, conditioning: Tensor) -> DepthOutputs:
+        return self._network.outputs(images, conditioning)
 
 
-def _exported(network: nn.Module, inputs: dict[str, Tensor], axes: dict[int, str]) -> bytes:
-    """Export for inputs of the examples' sizes, but for the named `axes`, which may have any."""
+def _exported(
+    network: nn.Module,
+    inputs: dict[str, Tensor],
+    axes: dict[int, str] | list[int],
+    outputs: Sequence[str] = (OUTPUT,),
+) -> bytes:
+    """Export for inputs of the examples' sizes, but for `axes`, which may have any; those of a name have the same."""
     content = io.BytesIO()
+    dynamic: dict[str, Any] = dict.fromkeys((*inputs, *outputs), axes)
     # The newer exporter needs two more packages and gives the same graph; torch before 2.5 does not know the word.
     older = {"dynamo": False} if "dynamo" in inspect.signature(torch.onnx.export).parameters else {}
     with warnings.catch_warnings():
@@ -90,8 +109,8 @@ def _exported(network: nn.Module, inputs: dict[str, Tensor], axes: dict[int, str
             content,  # type: ignore[arg-type]
             opset_version=_OPSET,
             input_names=list(inputs),
-            output_names=[OUTPUT],
-            dynamic_axes=dict.fromkeys((*inputs, OUTPUT), axes),
+            output_names=list(outputs),
+            dynamic_axes=dynamic,
             **older,  # type: ignore[arg-type]
         )
     return content.getvalue()
@@ -117,12 +136,17 @@ class OnnxRuntimeEngine:
 
     def disparity(self, rig: RigImages) -> Tensor:
         """See `DisparityEngine`."""
+        return self.details(rig).disparity
+
+    def details(self, rig: RigImages) -> DepthOutputs:
+        """See `DetailedEngine`."""
         if self._takes_images:
-            return image_by_image(lambda images: _run(self._session, {INPUT: images}), rig)
+            return DepthOutputs(image_by_image(lambda images: _run(self._session, {INPUT: images}), rig))
         if self._told is not None:
             (told,) = self._told(rig)
-            return image_by_image(lambda images: _run(self._session, {INPUT: images, CONDITIONING: told}), rig)
-        return _run(self._session, {name: getattr(rig, name) for name in self._inputs})
+            found = _run_all(self._session, {INPUT: rig.images.flatten(0, 1), CONDITIONING: told}, DETAILS)
+            return DepthOutputs(*(part.view(*rig.images.shape[:2], *part.shape[1:]) for part in found))
+        return DepthOutputs(_run(self._session, {name: getattr(rig, name) for name in self._inputs}))
 
 
 class TensorRtEngine:
@@ -215,10 +239,15 @@ def _session(model: bytes, providers: list[tuple[str, dict[str, Any]]]) -> Any:
 
 
 def _run(session: Any, inputs: Mapping[str, Tensor]) -> Tensor:
+    (disparity,) = _run_all(session, inputs, [OUTPUT])
+    return disparity
+
+
+def _run_all(session: Any, inputs: Mapping[str, Tensor], outputs: Sequence[str]) -> list[Tensor]:
     try:
-        (disparity,) = session.run([OUTPUT], {name: value.cpu().numpy() for name, value in inputs.items()})
+        found = session.run(list(outputs), {name: value.cpu().numpy() for name, value in inputs.items()})
     except Exception as error:
         if "memory" in str(error).lower() or "alloc" in str(error).lower():
             raise DeviceMemoryError(str(error)) from error
         raise EngineError(f"onnxruntime: inference failed: {error}") from error
-    return torch.from_numpy(disparity).to(next(iter(inputs.values())).device)
+    return [torch.from_numpy(part).to(next(iter(inputs.values())).device) for part in found]

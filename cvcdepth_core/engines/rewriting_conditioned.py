@@ -8,15 +8,21 @@ picture of a camera: it is made once for each calibration, and only added when t
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 - the field's name for it
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
+from cvcdepth_core.engines.conditioning import KeptForRig
 from cvcdepth_core.engines.rewriting import fold_batch_norms, mirrored
+from cvcdepth_core.networks import DepthOutputs, RigImages
 from cvcdepth_core.networks.efficientnet_lite import EfficientNetLite0Encoder
 from cvcdepth_core.networks.rig_conditioned import CHANNELS, RigConditionedNet
+
+IMAGES = "images"
+"""The first input of a rewritten network; `ToldConstants.names` are the others."""
 
 _LEVELS = 5  # H/2 ... H/32
 
@@ -48,12 +54,19 @@ class RewrittenRigConditionedNet(nn.Module):
         told_0: Tensor,
     ) -> Tensor:  # fmt: skip
         """Map images [M, 3, H, W] and what `ToldConstants` made of their cameras to the decoder's head."""
+        head: Tensor = self.head(self.features(images, told_stem, told_4, told_3, told_2, told_1, told_0))
+        return head
+
+    def features(
+        self, images: Tensor, told_stem: Tensor, told_4: Tensor, told_3: Tensor, told_2: Tensor, told_1: Tensor,
+        told_0: Tensor,
+    ) -> Tensor:  # fmt: skip
+        """Return what the last convolution, `head`, makes its result from."""
         features = self.encoder(images, told_stem)
         x = F.elu(self.top(features[4]) + told_4)
         for step, (level, told) in enumerate(((3, told_3), (2, told_2), (1, told_1), (0, told_0))):
             x = F.elu(self.upsampling[step](x) + self.skips[step](features[level]) + told)
-        head: Tensor = self.head(x)
-        return head
+        return x
 
 
 class ToldConstants(nn.Module):
@@ -82,6 +95,23 @@ class ToldConstants(nn.Module):
             for layer, level in zip(self.levels, reversed(range(_LEVELS)), strict=True)
         ]
         return (self.stem(told) * self.stem_scale, *levels, ground)
+
+
+class ToldDetails:
+    """The outputs of a network by an engine that runs its rewritten part, of pictures and of what it is told."""
+
+    def __init__(self, network: RigConditionedNet, device: torch.device) -> None:
+        constants = ToldConstants(network).to(device)
+        self._network = network
+        self._told = KeptForRig(lambda rig: constants(network.conditioning(rig).flatten(0, 1)))
+
+    @torch.inference_mode()
+    def __call__(self, rig: RigImages, run: Callable[[Mapping[str, Tensor]], Tensor]) -> DepthOutputs:
+        """Return [B, N, 1, H, W] each; `run` takes what the rewritten network takes, by name, to the head."""
+        *told, ground = self._told(rig)
+        inputs = {IMAGES: rig.images.flatten(0, 1), **dict(zip(ToldConstants.names, told, strict=True))}
+        outputs = self._network.from_head(run(inputs), ground)
+        return outputs.map(lambda part: part.view(*rig.images.shape[:2], *part.shape[1:]))
 
 
 class _Encoder(nn.Module):

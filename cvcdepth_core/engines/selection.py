@@ -15,7 +15,7 @@ import torch
 from cvcdepth_core.engines.engine import DisparityEngine
 from cvcdepth_core.engines.guarded_engine import GuardedEngine
 from cvcdepth_core.engines.parity import check_parity
-from cvcdepth_core.engines.torch_engine import TorchEagerEngine, TorchEngine
+from cvcdepth_core.engines.torch_engine import ConditionedTorchEngine, TorchEagerEngine, TorchEngine
 from cvcdepth_core.errors import ConfigError, EngineError
 from cvcdepth_core.model_choices import BACKENDS, Precision
 from cvcdepth_core.networks import DepthNet, DepthNetwork
@@ -241,10 +241,8 @@ def _build(
         from cvcdepth_core.engines.onnx_engine import OnnxRuntimeEngine
 
         return OnnxRuntimeEngine(network, spec, device)
-    if backend == "ncnn" and isinstance(network, RigConditionedNet):
-        from cvcdepth_core.engines.ncnn_engine import ConditionedNcnnEngine
-
-        return ConditionedNcnnEngine(network)
+    if isinstance(network, RigConditionedNet):
+        return _build_conditioned(backend, network, spec, device, precision)
     published = _published(network, spec, backend)
     if backend == "ncnn":
         from cvcdepth_core.engines.ncnn_engine import NcnnEngine
@@ -259,3 +257,17 @@ def _build(
 
         return TensorRtEngine(published, spec, device, precision)
     return TorchEngine(published, device, precision, compiled=backend == "torch_compiled")
+
+
+def _build_conditioned(
+    backend: str, network: RigConditionedNet, spec: DepthModelSpec, device: torch.device, precision: Precision
+) -> DisparityEngine:
+    if backend == "ncnn":
+        from cvcdepth_core.engines.ncnn_engine import ConditionedNcnnEngine
+
+        return ConditionedNcnnEngine(network)
+    if backend == "openvino":
+        from cvcdepth_core.engines.openvino_engine import ConditionedOpenVinoEngine
+
+        return ConditionedOpenVinoEngine(network, spec)
+    return ConditionedTorchEngine(network, device, precision)

@@ -4,16 +4,19 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor, nn
 
-from cvcdepth_core.engines.conditioning import KeptForRig, conditioning_of
+from cvcdepth_core.engines.conditioning import KeptForRig, KeptForWholeRig, conditioning_of
 from cvcdepth_core.engines.engine import best_chunk, image_by_image
 from cvcdepth_core.engines.rewriting import RewrittenDepthNet
+from cvcdepth_core.engines.rewriting_conditioned import RewrittenRigConditionedNet, ToldDetails
 from cvcdepth_core.model_choices import Precision
-from cvcdepth_core.networks import ConditionedNetwork, DepthNet, DepthNetwork, RigImages
+from cvcdepth_core.networks import ConditionedNetwork, DepthNet, DepthNetwork, DepthOutputs, RigImages
+from cvcdepth_core.networks.rig_conditioned import RigConditionedNet
+from cvcdepth_core.networks.vfdepth import FusedDepthNet
 
 
 class TorchEagerEngine:
@@ -27,15 +30,21 @@ class TorchEagerEngine:
         self._told = (
             KeptForRig(conditioning_of(self._network)) if isinstance(self._network, ConditionedNetwork) else None
         )
+        self._geometry = KeptForWholeRig(self._network.geometry) if isinstance(self._network, FusedDepthNet) else None
 
-    @torch.inference_mode()
     def disparity(self, rig: RigImages) -> Tensor:
         """See `DisparityEngine`."""
+        return self.details(rig).disparity
+
+    @torch.inference_mode()
+    def details(self, rig: RigImages) -> DepthOutputs:
+        """See `DetailedEngine`."""
         if isinstance(self._network, ConditionedNetwork) and self._told is not None:
-            found = self._network.disparity(rig.images.flatten(0, 1), *self._told(rig))
-            return found.view(*rig.images.shape[:2], *found.shape[1:])
-        disparity: Tensor = self._network(rig)
-        return disparity
+            found = self._network.outputs(rig.images.flatten(0, 1), *self._told(rig))
+            return found.map(lambda part: part.view(*rig.images.shape[:2], *part.shape[1:]))
+        if isinstance(self._network, FusedDepthNet) and self._geometry is not None:
+            return DepthOutputs(self._network.disparity(rig.images, self._geometry(rig)))
+        return self._network.details(rig)
 
 
 class TorchEngine:
@@ -57,6 +66,33 @@ class TorchEngine:
     def disparity(self, rig: RigImages) -> Tensor:
         """See `DisparityEngine`."""
         return image_by_image(lambda images: self._run(images.contiguous(memory_format=torch.channels_last)), rig)
+
+
+class ConditionedTorchEngine:
+    """The rewritten network that is told its rig, with channels last; its head and all after it in float32."""
+
+    def __init__(self, network: RigConditionedNet, device: torch.device, precision: Precision = "float32") -> None:
+        self.name = f"torch {torch.__version__} {precision}"
+        self.device = device
+        self.chunk = best_chunk(network, device)
+        self._dtype = getattr(torch, precision)
+        rewritten = RewrittenRigConditionedNet(network).to(device, self._dtype)
+        rewritten.head.float()
+        self._rewritten = rewritten.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self._details = ToldDetails(network, device)
+
+    def disparity(self, rig: RigImages) -> Tensor:
+        """See `DisparityEngine`."""
+        return self.details(rig).disparity
+
+    def details(self, rig: RigImages) -> DepthOutputs:
+        """See `DetailedEngine`."""
+        return self._details(rig, self._run)
+
+    def _run(self, inputs: Mapping[str, Tensor]) -> Tensor:
+        given = [part.to(self._dtype).contiguous(memory_format=torch.channels_last) for part in inputs.values()]
+        head: Tensor = self._rewritten.head(self._rewritten.features(*given).float())
+        return head
 
 
 class PaddedBatches:

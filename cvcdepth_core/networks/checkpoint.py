@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import hashlib
 import pickle
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import torch
 from pydantic import ValidationError
@@ -21,8 +23,9 @@ from torch import Tensor, nn
 from cvcdepth_core.errors import CheckpointError, validation_messages
 from cvcdepth_core.files import write_atomically
 from cvcdepth_core.networks.encoders import Encoder
-from cvcdepth_core.networks.registry import DepthModelSpec, build_depth_network
+from cvcdepth_core.networks.registry import RELEASED_NAMES, DepthModelSpec, build_depth_network
 from cvcdepth_core.networks.rig_images import DepthNetwork
+from cvcdepth_core.networks.vfdepth import VolumePoseNet, renamed
 
 FORMAT_VERSION = "1"
 
@@ -81,13 +84,11 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     """
     path = Path(path)
     digest = _sha256([path])
-    header, tensors = _read_safetensors(path)
-    version = header.pop(_VERSION_KEY, None)
-    if version != FORMAT_VERSION:
-        raise CheckpointError(f"{path}: format version is {version!r}, expected {FORMAT_VERSION!r}")
+    with _opened(path) as file:
+        header, tensors = dict(file.metadata() or {}), {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
     return Checkpoint(
         path=path,
-        spec=_parse_spec(path, header.pop(_SPEC_KEY, None)),
+        spec=_take_spec(path, header),
         depth_net=_without_prefix(_DEPTH_PREFIX, tensors),
         pose_net=_without_prefix(_POSE_PREFIX, tensors),
         sha256=digest,
@@ -95,18 +96,37 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     )
 
 
-def import_released(directory: str | Path, spec: DepthModelSpec) -> Checkpoint:
-    """Read the authors' `weights_<n>/{depth_net,pose_net}.pth` (method section 10).
+def load_spec(path: str | Path) -> DepthModelSpec:
+    """Return what a checkpoint's network is for, without reading its weights; raises as `load_checkpoint`."""
+    path = Path(path)
+    _refuse_missing(path)
+    with _opened(path) as file:
+        return _take_spec(path, dict(file.metadata() or {}))
 
-    `spec` says what they were trained for. Raises CheckpointError naming the file when one is missing, damaged, holds
-    more than tensors, or does not fit `spec`.
+
+def import_released(directory: str | Path, spec: DepthModelSpec) -> Checkpoint:
+    """Read the authors' `weights_<n>/{depth_net,pose_net}.pth` (method section 10), or those of VFDepth's authors.
+
+    `spec` says what they were trained for, and so whose they are. Raises CheckpointError naming the file when one is
+    missing, damaged, holds more than tensors, or does not fit `spec`.
     """
     files = [Path(directory) / "depth_net.pth", Path(directory) / "pose_net.pth"]
     digest = _sha256(files)
-    depth_net, pose_net = (_without_prefix(_RELEASED_PREFIX, _read_tensors_of_pickle(file)) for file in files)
+    names = RELEASED_NAMES.get(spec.network, ({}, {}))
+    depth_net, pose_net = (renamed(_released_state(file), of_file) for file, of_file in zip(files, names, strict=True))
     checkpoint = Checkpoint(Path(directory), spec, depth_net, pose_net, digest)
     checkpoint.build_depth_net()
+    if spec.volume is not None:
+        load_network_state(
+            VolumePoseNet(spec.encoder, spec.volume), pose_net, f"{files[1]}: pose network ({spec.kind})"
+        )
     return checkpoint
+
+
+def _released_state(file: Path) -> dict[str, Tensor]:
+    """Return a file's tensors; networks that were trained by several processes have a prefix."""
+    tensors = _read_tensors_of_pickle(file)
+    return _without_prefix("", {key.removeprefix(_RELEASED_PREFIX): value for key, value in tensors.items()})
 
 
 def half_precision(state: State) -> dict[str, Tensor]:
@@ -178,10 +198,12 @@ def _without_prefix(prefix: str, tensors: State) -> dict[str, Tensor]:
     }
 
 
-def _read_safetensors(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """Give a safetensors file; CheckpointError, also while it is read, says why it is none."""
     try:
         with safe_open(path, framework="pt") as file:
-            return dict(file.metadata() or {}), {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+            yield file
     except SafetensorError as error:
         raise CheckpointError(f"{path}: {_why_unreadable(path)}: {error}") from error
 
@@ -203,7 +225,11 @@ def _read_tensors_of_pickle(path: Path) -> dict[str, Tensor]:
     return dict(state)
 
 
-def _parse_spec(path: Path, text: str | None) -> DepthModelSpec:
+def _take_spec(path: Path, header: dict[str, str]) -> DepthModelSpec:
+    """Return the spec, and leave in the header what the writer added; CheckpointError where it is of another format."""
+    version, text = header.pop(_VERSION_KEY, None), header.pop(_SPEC_KEY, None)
+    if version != FORMAT_VERSION:
+        raise CheckpointError(f"{path}: format version is {version!r}, expected {FORMAT_VERSION!r}")
     if text is None:
         raise CheckpointError(f"{path}: has no model spec in its metadata")
     try:

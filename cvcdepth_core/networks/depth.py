@@ -95,12 +95,12 @@ class DepthDecoder(nn.Module):
 class ReflectConv(nn.Module):
     """3x3 convolution over a border that repeats the image mirrored."""
 
-    def __init__(self, in_channels: int, out_channels: int) -> None:
+    def __init__(self, in_channels: int, out_channels: int, stride: int = 1) -> None:
         super().__init__()
-        self.conv = nn.Conv2d(in_channels, out_channels, 3, padding=1, padding_mode="reflect")
+        self.conv = nn.Conv2d(in_channels, out_channels, 3, stride, padding=1, padding_mode="reflect")
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map [B, in, H, W] to [B, out, H, W]."""
+        """Map [B, in, H, W] to [B, out, H / stride, W / stride]."""
         out: Tensor = self.conv(x)
         return out
 

@@ -28,17 +28,18 @@ def mirror_motion(motions: Tensor, flips: Tensor, axis: int = 0) -> Tensor:
     return _where(flips, _negated(_negated(motions, -2, axis), -1, axis), motions)
 
 
-def mirror_rig(rig: RigImages, flips: Tensor) -> RigImages:
+def mirror_rig(rig: RigImages, flips: Tensor, offset: int = 0) -> RigImages:
     """Mirror the world of the samples where `flips` [B] says so: every picture, and the rig that took them.
 
     E -> S_v E S_c with S_v = diag(1, -1, 1, 1) across the vehicle and S_c = diag(-1, 1, 1, 1) across the image: a rig
-    that could be built, so that a network which looks at the mounts can be trained with flips too.
+    that could be built, so that a network which looks at the mounts can be trained with flips too. `offset` is the
+    network's `mirror_offset`.
     """
     width = rig.images.shape[-1]
     mounts = _negated(_negated(rig.base_T_camera, -2, LATERAL_AXIS), -1, 0)
     return rig._replace(
         images=mirror(rig.images, flips),
-        intrinsics=_where(flips, _mirrored_intrinsics(rig.intrinsics, width), rig.intrinsics),
+        intrinsics=_where(flips, _mirrored_intrinsics(rig.intrinsics, width - offset), rig.intrinsics),
         base_T_camera=_where(flips, mounts, rig.base_T_camera),
         masks=mirror(rig.masks, flips),
     )
@@ -68,7 +69,7 @@ def _per_sample(flips: Tensor, like: Tensor) -> Tensor:
     return flips.to(like.device).view(-1, *[1] * (like.ndim - 1))
 
 
-def mirrored_pictures(surround: SurroundPictures) -> SurroundPictures:
+def mirrored_pictures(surround: SurroundPictures, offset: int = 0) -> SurroundPictures:
     """Return a set as `mirror_rig` has it: every picture mirrored, and the rig that took them."""
     rig = RigImages(
         images=torch.from_numpy(surround.pictures).permute(0, 3, 1, 2)[None],
@@ -77,7 +78,7 @@ def mirrored_pictures(surround: SurroundPictures) -> SurroundPictures:
         present=torch.tensor(surround.present)[None],
         masks=torch.tensor(surround.valid)[None, :, None],
     )
-    mirrored = mirror_rig(rig, torch.tensor([True]))
+    mirrored = mirror_rig(rig, torch.tensor([True]), offset)
     return SurroundPictures(
         pictures=np.ascontiguousarray(mirrored.images[0].permute(0, 2, 3, 1).numpy()),
         present=surround.present,

@@ -41,13 +41,14 @@ class PoseNet(nn.Module):
 class PoseDecoder(nn.Module):
     """Four convolutions and a mean over the image."""
 
-    def __init__(self, in_channels: int) -> None:
+    def __init__(self, in_channels: int, stride: int = 1) -> None:
+        """`stride` is that of both 3x3 convolutions."""
         super().__init__()
         self.net = nn.ModuleList(
             [
                 nn.Conv2d(in_channels, 256, 1),
-                nn.Conv2d(256, 256, 3, padding=1),
-                nn.Conv2d(256, 256, 3, padding=1),
+                nn.Conv2d(256, 256, 3, stride, padding=1),
+                nn.Conv2d(256, 256, 3, stride, padding=1),
                 nn.Conv2d(256, 6, 1),
             ]
         )

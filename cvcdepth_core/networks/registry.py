@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
+import torch
 from pydantic import (
     BaseModel,
     ConfigDict,
@@ -20,11 +21,15 @@ from cvcdepth_core.model_choices import ENCODERS
 from cvcdepth_core.networks.depth import INPUT_STRIDE, MIN_INPUT_SIZE, DepthNet
 from cvcdepth_core.networks.rig_conditioned import RigConditionedNet
 from cvcdepth_core.networks.rig_images import DepthNetwork
+from cvcdepth_core.networks.vfdepth import DEPTH_NAMES, POSE_NAMES, CorrectedFusedDepthNet, FusedDepthNet
+from cvcdepth_core.networks.volume import VolumeSpec
 
 PER_CAMERA = "per_camera"
 """The published network, which looks at every camera on its own."""
 RIG_CONDITIONED = "rig_conditioned"
 """The network that is told its rig: see `RigConditionedNet`."""
+VFDEPTH = "vfdepth"
+"""The network that fuses its cameras in a volume: see `FusedDepthNet`."""
 
 
 class DepthModelSpec(BaseModel):
@@ -46,6 +51,8 @@ class DepthModelSpec(BaseModel):
     """Metres at disparity 0 for such a camera."""
     focal_scale: float = Field(default=300.0, gt=0, allow_inf_nan=False)
     """Focal length in pixels (at network resolution) for which the depth range is meant."""
+    volume: VolumeSpec | None = None
+    """For `network: vfdepth`: the volume that the cameras are fused in."""
 
     @property
     def kind(self) -> str:
@@ -76,6 +83,19 @@ class DepthModelSpec(BaseModel):
             raise ValueError(f"expected one of {', '.join(ENCODERS)}")
         return encoder
 
+    @model_validator(mode="before")
+    @classmethod
+    def _volume_is_the_published_one(cls, fields: Any) -> Any:
+        if isinstance(fields, dict) and fields.get("network") == VFDEPTH and fields.get("volume") is None:
+            return fields | {"volume": VolumeSpec()}
+        return fields
+
+    @model_validator(mode="after")
+    def _volume_is_the_networks(self) -> DepthModelSpec:
+        if self.volume is not None and self.network != VFDEPTH:
+            raise ValueError(f"volume is given, but the network {self.network} has none: expected network {VFDEPTH}")
+        return self
+
     @model_validator(mode="after")
     def _encoder_is_the_networks(self) -> DepthModelSpec:
         if self.is_told_its_rig and self.encoder != RigConditionedNet.ENCODER:
@@ -96,7 +116,44 @@ class DepthModelSpec(BaseModel):
         fields: dict[str, Any] = serialise(self)
         if fields.get("network") == PER_CAMERA:
             del fields["network"]
+        if fields.get("volume") is None:
+            fields.pop("volume", None)
         return fields
+
+
+def _fused(spec: DepthModelSpec) -> FusedDepthNet:
+    volume = spec.volume or VolumeSpec()
+    return (CorrectedFusedDepthNet if volume.corrected else FusedDepthNet)(spec.encoder, volume)
+
+
+class NetworkDescription(NamedTuple):
+    """What can be said of a kind of network without weights."""
+
+    name: str
+    encoder: str
+    """With which it is described."""
+    parameters: int
+    independent: bool
+    """See `DepthNetwork`."""
+    engines: tuple[str, ...]
+    summary: str
+    """One line."""
+
+
+def describe_networks() -> list[NetworkDescription]:
+    """Return every kind, with the encoder that it is usually built on and its published widths."""
+    return [_described(name) for name in NETWORKS]
+
+
+def _described(name: str) -> NetworkDescription:
+    encoder = RigConditionedNet.ENCODER if name == RIG_CONDITIONED else "resnet18"
+    with torch.device("meta"):
+        network = build_depth_network(
+            DepthModelSpec(network=name, encoder=encoder, height=384, width=640, min_depth=0.5, max_depth=200.0)
+        )
+    parameters = sum(parameter.numel() for parameter in network.parameters())
+    summary = str(type(network).__doc__).splitlines()[0]
+    return NetworkDescription(name, encoder, parameters, network.independent, network.engines, summary)
 
 
 def build_depth_network(spec: DepthModelSpec) -> DepthNetwork:
@@ -107,5 +164,9 @@ def build_depth_network(spec: DepthModelSpec) -> DepthNetwork:
 NETWORKS: dict[str, Callable[[DepthModelSpec], DepthNetwork]] = {
     PER_CAMERA: lambda spec: DepthNet(spec.encoder),
     RIG_CONDITIONED: lambda spec: RigConditionedNet(spec.min_depth, spec.max_depth, spec.focal_scale),
+    VFDEPTH: _fused,
 }
 """Each kind's name in checkpoints and training files, and what builds one with random weights."""
+
+RELEASED_NAMES: dict[str, tuple[Mapping[str, str], Mapping[str, str]]] = {VFDEPTH: (DEPTH_NAMES, POSE_NAMES)}
+"""How names begin in the released depth and pose network, and in ours, of kinds whose names differ."""

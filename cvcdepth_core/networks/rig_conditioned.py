@@ -41,7 +41,7 @@ class RigConditionedNet(ConditionedNetwork):
     """
 
     independent: ClassVar[bool] = True
-    engines: ClassVar[tuple[str, ...]] = ("ncnn", "onnxruntime", "torch_eager")
+    engines: ClassVar[tuple[str, ...]] = ("ncnn", "openvino", "torch", "onnxruntime", "torch_eager")
     ENCODER: ClassVar[str] = "efficientnet_lite0"
 
     def __init__(self, min_depth: float, max_depth: float, focal_scale: float) -> None:
@@ -67,12 +67,8 @@ class RigConditionedNet(ConditionedNetwork):
 
     def details(self, rig: RigImages) -> DepthOutputs:
         """Return all outputs; ImageError when H or W is not a multiple of 32 or below 64."""
-        outputs = self._outputs(rig.images.flatten(0, 1), self.conditioning(rig).flatten(0, 1))
+        outputs = self.outputs(rig.images.flatten(0, 1), self.conditioning(rig).flatten(0, 1))
         return outputs.map(lambda part: part.view(*rig.images.shape[:2], *part.shape[1:]))
-
-    def disparity(self, images: Tensor, conditioning: Tensor) -> Tensor:
-        """See `ConditionedNetwork`."""
-        return self._outputs(images, conditioning).disparity
 
     @torch.no_grad()
     def conditioning(self, rig: RigImages) -> Tensor:
@@ -81,7 +77,8 @@ class RigConditionedNet(ConditionedNetwork):
         x, y = _ray_slopes(rig.intrinsics, height, width)
         return _conditioning(x, y, rig.intrinsics[..., 0, 0], rig.base_T_camera, self._focal_scale)
 
-    def _outputs(self, images: Tensor, conditioning: Tensor) -> DepthOutputs:
+    def outputs(self, images: Tensor, conditioning: Tensor) -> DepthOutputs:
+        """See `ConditionedNetwork`; ImageError when H or W is not a multiple of 32 or below 64."""
         refuse_input_size(*images.shape[-2:])
         told, ground = conditioning.split([CHANNELS, 1], dim=1)  # type: ignore[no-untyped-call]
         return self.from_head(self.depth_decoder(self._features(images, told), told), ground)

@@ -81,6 +81,9 @@ class DepthNetwork(nn.Module, ABC):
     chunks, and one that nobody wants need not be computed."""
     engines: ClassVar[tuple[str, ...]]
     """The backends that can run it, the one that `auto` takes first where it is installed at the front."""
+    mirror_offset: ClassVar[int] = 0
+    """Pixels by which a mirrored picture's principal point has to lie left of the place that mirroring gives it, for
+    networks that take a feature's place for that of the first of its pixels: see `mirror_rig`."""
 
     @abstractmethod
     def forward(self, rig: RigImages) -> Tensor:
@@ -102,8 +105,8 @@ class ConditionedNetwork(DepthNetwork):
         """Return [B, N, C, H, W], made of `rig`'s calibration and of the size of its images."""
 
     @abstractmethod
-    def disparity(self, images: Tensor, conditioning: Tensor) -> Tensor:
-        """Return the disparity [M, 1, H, W] in [0, 1] of images [M, 3, H, W] and their conditioning [M, C, H, W]."""
+    def outputs(self, images: Tensor, conditioning: Tensor) -> DepthOutputs:
+        """Return all outputs [M, 1, H, W] of images [M, 3, H, W] and their conditioning [M, C, H, W]."""
 
 
 def _float32(array: np.ndarray[Any, Any], device: torch.device | str) -> Tensor:

@@ -72,6 +72,25 @@ def sample_prediction(
     return np.where(is_shown, _blend(upper, lower, down), np.nan)
 
 
+def resized_truth(truth: SparseDepth, height: int, width: int, part: PicturePart | None = None) -> NDArray[np.float32]:
+    """Return truth as an image [height, width] of `part` of its picture, metres; inf in the sky, NaN where unknown.
+
+    Each pixel has the truth that is nearest to its centre among all that lies in it: depth is never averaged.
+    """
+    part = part or PicturePart(0.0, 0.0, truth.width, truth.height)
+    rows = np.concatenate([truth.rows, truth.sky[:, 0]])
+    columns = np.concatenate([truth.columns, truth.sky[:, 1]])
+    depth = np.concatenate([truth.depth, np.full(len(truth.sky), np.inf)])
+    v = (rows - part.top + 0.5) * height / part.height - 0.5
+    u = (columns - part.left + 0.5) * width / part.width - 0.5
+    at_v, at_u = np.floor(v + 0.5).astype(np.int64), np.floor(u + 0.5).astype(np.int64)
+    inside = (at_v >= 0) & (at_v < height) & (at_u >= 0) & (at_u < width)
+    farthest_first = np.argsort(-np.hypot(v - at_v, u - at_u)[inside], kind="stable")  # the last one stays
+    image = np.full((height, width), np.nan, np.float32)
+    image[at_v[inside][farthest_first], at_u[inside][farthest_first]] = depth[inside][farthest_first]
+    return image
+
+
 def downsample_ground_truth(depth: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:
     """Move the points of a sparse depth image [H, W] (metres, 0 unknown) to the pixels of [height, width].
 

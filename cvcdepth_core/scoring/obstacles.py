@@ -169,7 +169,7 @@ class ObstacleScorer:
         """
         cloud = merged_cloud(surround, rig, _CLOUD)
         seen = TrueSpace.of(rig, truth, self._limits)
-        plane = fit_ground(cloud, rig.ground_height)
+        plane = fit_ground(cloud, rig.ground_z)
         heights = plane.heights(cloud)
         self._total.high[0] += (len(cloud), int((heights > HIGH).sum()))
         self._total.high[1] += seen.high
@@ -242,7 +242,7 @@ class TrueSpace:
         views = [_points(camera.rectified_view.intrinsics, camera.base_T_camera, known)
                  for camera, known in zip(rig.cameras, truth, strict=True)]  # fmt: skip
         points = np.concatenate(views)
-        plane = fit_ground(points, rig.ground_height)
+        plane = fit_ground(points, rig.ground_z)
         heights = plane.heights(points)
         is_low, is_near = heights <= limits.max_height, np.hypot(points[:, 0], points[:, 1]) <= limits.max_range
         obstacles = points[is_low & is_near & (heights >= limits.min_height)]

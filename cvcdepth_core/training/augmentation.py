@@ -1,14 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the networks see differently from the losses: colour jitter (method section 2), and the coins of Hflip-S."""
+"""Changes to samples: colour jitter (method section 2) and Hflip-S, of which the losses see nothing, and windows."""
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
 from typing import Literal
 
 import torch
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
+from torch.nn import functional as F  # noqa: N812 - the field's name for it
+
+from cvcdepth_core.training.batch import RigBatch
 
 _LUMA = (0.299, 0.587, 0.114)
 """Weights of ITU-R BT.601, as image editors convert to grey."""
@@ -101,6 +105,46 @@ _COLOR_CHANGES: dict[str, Callable[[Tensor, float], Tensor]] = {
 def _grey(images: Tensor) -> Tensor:
     weights = images.new_tensor(_LUMA)[:, None, None]
     return (images * weights).sum(dim=-3, keepdim=True).expand_as(images)
+
+
+def zoom_in(batch: RigBatch, zoom: float, generators: Sequence[torch.Generator]) -> RigBatch:
+    """Return a batch with a random window of each camera's pictures in their place, down to 1 / `zoom` of their width.
+
+    The calibration follows, and mask and truth, so that networks and losses have other lenses to learn from; all frames
+    of a camera have the same window. `generators` are CPU ones, one per sample.
+    """
+    if zoom == 1.0:
+        return batch
+    draws = [torch.rand(batch.cameras, 3, generator=generator, dtype=torch.float64) for generator in generators]
+    share, left, top = torch.stack(draws).to(batch.intrinsics).unbind(-1)
+    share = 1 / zoom + (1 - 1 / zoom) * share
+    height, width = batch.frames.shape[-2:]
+    corner = torch.stack([left * (1 - share) * width, top * (1 - share) * height], dim=-1)
+    zoomed = copy.copy(batch)
+    zoomed.intrinsics = batch.intrinsics.clone()
+    zoomed.intrinsics[..., :2, :2] /= share[..., None, None]
+    zoomed.intrinsics[..., :2, 2] = (batch.intrinsics[..., :2, 2] + 0.5 - corner) / share[..., None] - 0.5
+    grid = _window_grid(share, corner, height, width)
+    by_camera = batch.frames.transpose(1, 2)
+    zoomed.frames = _sampled(by_camera.flatten(2, 3), grid, "bilinear").view(by_camera.shape).transpose(1, 2)
+    zoomed.masks = _sampled(batch.masks, grid, "nearest")
+    zoomed.truth = None if batch.truth is None else _sampled(batch.truth, grid, "nearest")
+    return zoomed
+
+
+def _window_grid(share: Tensor, corner: Tensor, height: int, width: int) -> Tensor:
+    """Return where the pixels [B, N, H, W, 2] of windows lie in their pictures, as `grid_sample` has it."""
+    u, v = (torch.arange(size, device=share.device, dtype=share.dtype) + 0.5 for size in (width, height))
+    x = (u * share[..., None] + corner[..., :1]) * 2 / width - 1
+    y = (v * share[..., None] + corner[..., 1:]) * 2 / height - 1
+    shape = (*share.shape, height, width)
+    return torch.stack([x[..., None, :].expand(shape), y[..., None].expand(shape)], dim=-1)
+
+
+def _sampled(images: Tensor, grid: Tensor, mode: str) -> Tensor:
+    """Sample images [B, N, C, H, W] at a grid [B, N, H, W, 2]."""
+    found = F.grid_sample(images.flatten(0, 1), grid.flatten(0, 1).to(images), mode, "border", align_corners=False)
+    return found.view(images.shape)
 
 
 def draw_flips(generators: Sequence[torch.Generator]) -> Tensor:

@@ -49,6 +49,9 @@ class RigBatch:
     `base_T_camera` that of the target; None where the losses take the pose network's motion."""
     truth: Tensor | None = None
     """[B, N, 1, H, W] metres along the optical axis; inf in the sky, NaN where it is not known."""
+    truth_is_sparse: bool = False
+    """Whether truth is of single points, as a LiDAR's: then it knows nothing of the sky, and points side by side may be
+    of different surfaces where sensor and camera see past different edges."""
 
     def __post_init__(self) -> None:
         _check_shapes(self)

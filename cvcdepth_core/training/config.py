@@ -12,14 +12,17 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from cvcdepth_core.errors import ConfigError, validation_messages
 from cvcdepth_core.files import load_yaml
-from cvcdepth_core.model_choices import EncoderName
+from cvcdepth_core.model_choices import DEFAULT, EncoderName, checkpoint_path
+from cvcdepth_core.networks.checkpoint import load_spec
 from cvcdepth_core.networks.pose import MAX_TRANSLATION
 from cvcdepth_core.networks.registry import DepthModelSpec
 from cvcdepth_core.training.augmentation import ColorJitterConfig, FlipMode
 from cvcdepth_core.training.model import PoseMethod
+from cvcdepth_core.training.novel_views import NovelViewsConfig
 from cvcdepth_core.training.objective import ObjectiveConfig
 
 ExposureMotion = Literal["auto", "recorded", "network", "none"]
+Supervision = Literal["none", "lidar", "depth"]
 MotionSource = Literal["auto", "recorded", "network"]
 
 _BASE_KEY = "base"
@@ -39,12 +42,15 @@ class PoseConfig(_Section):
 
 
 class AugmentationConfig(_Section):
-    """Changes to the images that the networks see; the losses compare the unchanged ones."""
+    """Changes to samples; but for `zoom`, the losses compare the unchanged pictures."""
 
     color_jitter: ColorJitterConfig = ColorJitterConfig()
     """Random colour changes, per camera."""
     flip: FlipMode = "both"
     """Hflip-S: which networks see half of the samples mirrored."""
+    zoom: float = Field(default=1.0, ge=1, le=4)
+    """Of recordings: a random window of each camera's pictures takes their place, down to one of this many parts of
+    their width, with its own calibration, so that there are other lenses to learn from; 1 takes whole pictures."""
 
 
 class RecordingsConfig(_Section):
@@ -76,6 +82,10 @@ class RecordingsConfig(_Section):
     `recorded` (odometry or /tf), `network` (as the pose network says, at constant velocity between two sets), `auto`
     (recorded where there is some, else of the network), or `none`, as in the published method, which takes the
     exposures as simultaneous. `true` is `auto`, `false` is `none`."""
+    supervise: Supervision = "none"
+    """Whether depth is learnt from recorded truth too, beside the pictures: `lidar` (the sweep nearest to each picture,
+    moved by the recorded motion, without the points that a camera cannot see; of recordings that have one), or `depth`
+    (true depth images, as `simulate` records them)."""
     tolerance: float = Field(default=0.1, gt=0, le=10)
     """Seconds that two images of one set may be apart."""
     workers: int = Field(default=0, ge=0)
@@ -102,6 +112,11 @@ class WorldsConfig(_Section):
     """Share of the camera's height, standard deviation, by which the network is told it wrongly."""
     held_out: float = Field(default=0.03, ge=0, lt=1)
     """The last share of the drives, which is scored and never trained on."""
+    share: float = Field(default=0.5, ge=0, lt=1)
+    """Of `finetune --worlds`: which share of the pictures whose depth is learnt comes from worlds, in every step; 0
+    scores the worlds and learns from none. `--keep-general` takes its place."""
+    weight: float = Field(default=1.0, gt=0)
+    """Of `finetune --worlds`: by how much more a picture of a world counts in a step than one of a recording."""
 
 
 class OptimizerConfig(_Section):
@@ -174,7 +189,9 @@ class TrainingConfig(_Section):
     objective: ObjectiveConfig = ObjectiveConfig()
     """Weights and variants of the loss."""
     augmentation: AugmentationConfig = AugmentationConfig()
-    """Changes to the images that the networks see; the losses compare the unchanged ones."""
+    """Changes to samples."""
+    synthesis: NovelViewsConfig = NovelViewsConfig()
+    """For the objective's `synthesis_...` terms: how far the cameras are turned."""
     recordings: RecordingsConfig = RecordingsConfig()
     """For `dataset: recording`: which moments become samples, and how they are read."""
     worlds: WorldsConfig = WorldsConfig()
@@ -201,17 +218,46 @@ class TrainingConfig(_Section):
             )
         return self
 
+    @model_validator(mode="after")
+    def _synthesis_has_a_volume(self) -> TrainingConfig:
+        loss, volume = self.objective, self.depth.volume
+        if loss.synthesises and (volume is None or volume.skips):
+            raise ValueError(
+                f"objective.synthesis_consistency is {loss.synthesis_consistency:g} and synthesis_smoothness "
+                f"{loss.synthesis_smoothness:g}, but depth.network is {self.depth.network}, "
+                + ("expected vfdepth" if volume is None else "whose skips show a turned camera another one's picture")
+            )
+        return self
 
-def load_training_config(path: str | Path) -> TrainingConfig:
+
+def load_training_config(path: str | Path, start: DepthModelSpec | None = None) -> TrainingConfig:
     """Read a training configuration; `base: FILE` names a file, relative to this one, that it builds on.
+
+    What it does not say of the network is as in `start`, what the weights that training begins with are for; a file
+    without a word of it, and without a start, means the network of the package's own model.
 
     Raises ConfigError naming the file, the field, the value found and what is allowed.
     """
     path = Path(path)
     try:
-        return TrainingConfig.model_validate(_read_with_bases(path, above=()))
+        return TrainingConfig.model_validate(_with_network(_read_with_bases(path, above=()), start))
     except ValidationError as error:
         raise ConfigError(f"{path}: {validation_messages(error, TrainingConfig)}") from error
+
+
+def _with_network(fields: dict[str, Any], start: DepthModelSpec | None) -> dict[str, Any]:
+    named = fields.get("depth", {})
+    if start is None and "depth" not in fields:
+        start = load_spec(checkpoint_path(DEFAULT))
+    if start is None or not isinstance(named, dict):
+        return fields
+    width = named.get("width")
+    # Depth goes with fx / focal_scale, and fx with the width.
+    scale = width / start.width if isinstance(width, int) else 1.0
+    known = {"network": start.network, **start.model_dump(), "focal_scale": start.focal_scale * scale}
+    if named.get("network", start.network) != start.network:
+        known.pop("volume", None)
+    return {**fields, "depth": known | named}
 
 
 def _read_with_bases(path: Path, above: tuple[Path, ...]) -> dict[str, Any]:

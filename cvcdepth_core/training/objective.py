@@ -29,6 +29,7 @@ from cvcdepth_core.rendering.view_synthesis import (
 from cvcdepth_core.training.batch import RigBatch
 from cvcdepth_core.training.losses import auto_mask, motion_error, pose_consistency, smoothness
 from cvcdepth_core.training.motion import motions_seen_from_anchor, relative_poses
+from cvcdepth_core.training.novel_views import NovelViews, consistency_of_views, smoothness_of_views
 from cvcdepth_core.training.truth_losses import LogErrors, sky_error
 
 _IDENTITY_NOISE = 1e-5
@@ -40,6 +41,8 @@ class ObjectiveConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
+    temporal: float = Field(default=1.0, ge=0)
+    """Weight of the photometric error of views rendered from the camera's own pictures at the context moments."""
     smoothness: float = Field(default=0.1, ge=0)
     """Weight of the edge-aware smoothness of the disparity."""
     spatial: float = Field(default=0.03, ge=0)
@@ -52,6 +55,10 @@ class ObjectiveConfig(BaseModel):
     """Weight of the difference between spatial and spatio-temporal reconstructions (MVRCL)."""
     pose_consistency: float = Field(default=0.0, ge=0)
     """Weight of the agreement of the cameras' own motions (FSM baseline: 0.1); only with one pose per camera."""
+    synthesis_consistency: float = Field(default=0.0, ge=0)
+    """Weight of the difference between depth at turned cameras and the cameras' own; only with `network: vfdepth`."""
+    synthesis_smoothness: float = Field(default=0.0, ge=0)
+    """Weight of the smoothness of disparity at turned cameras."""
     recorded_motion: float = Field(default=1.0, ge=0)
     """Weight of the pose network's difference to the recorded motion, see `losses.motion_error`; there is no such term
     where none is recorded, or `recordings.motion` does not take it."""
@@ -65,12 +72,20 @@ class ObjectiveConfig(BaseModel):
     """Weight of the sky: that depth is far there, and that the network says so if it can."""
     truth_uncertainty: float = Field(default=0.05, ge=0)
     """Weight of how well the network foretells its own error, if it does."""
+    leave_out_sky: bool = False
+    """Compare no pictures and no depth where the network says that there is the sky, and smooth nothing across its
+    outline: without parallax nothing holds it where it is. Of networks that tell the sky; truth has to teach it."""
     depth_warping: Literal["ddcl", "dcl"] = "ddcl"
     """How the neighbour's depth comes to the camera: dense backward warping (DDCL) or sparse splatting (DCL)."""
     corrected: bool = False
     """Depart from the published method: refuse points behind a camera, take the deviation for the intensity alignment
     over the overlap only, average instead of add where two neighbours see the same pixel, binarise masks, and leave
-    what they mask out of the smoothness."""
+    what they mask out of the smoothness; of novel views, take the range that the lens gives."""
+
+    @property
+    def synthesises(self) -> bool:
+        """Whether a term needs the views of turned cameras."""
+        return max(self.synthesis_consistency, self.synthesis_smoothness) > 0
 
 
 @dataclass(frozen=True)
@@ -87,10 +102,13 @@ class Prediction:
     """[B, N, 1, H, W] logit of the sky, of networks that tell it."""
     log_uncertainty: Tensor | None = None
     """[B, N, 1, H, W] logarithm of the expected error of log depth, of networks that tell it."""
+    novel: NovelViews | None = None
+    """What turned cameras would see, where it was asked for."""
 
     def first_sample(self) -> Prediction:
         """Return the output for the first sample, without its gradient."""
-        return Prediction(*(part[:1].detach() for part in (self.disparity, self.depth, self.motions)))
+        disparity, depth, motions = (part[:1].detach() for part in (self.disparity, self.depth, self.motions))
+        return Prediction(disparity, depth, motions, None if self.sky is None else self.sky[:1].detach())
 
 
 @dataclass(frozen=True)
@@ -172,7 +190,7 @@ class ObjectiveValue:
     per_sample: Tensor
     """[B] weighted total of each sample, the mean over its cameras."""
     terms: Mapping[str, Tensor]
-    """[B, N] unweighted value of each term, by the names of `ObjectiveConfig`, and `temporal`."""
+    """[B, N] unweighted value of each term, by the names of `ObjectiveConfig`."""
 
     @property
     def loss(self) -> Tensor:
@@ -191,7 +209,9 @@ def evaluate_objective(
     with torch.autocast(batch.frames.device.type, enabled=False):
         terms = _self_supervised_terms(batch, prediction, config, identity_noise) if len(batch.contexts[0]) else {}
         if batch.truth is not None and config.truth > 0:
-            terms |= _truth_terms(batch.truth, prediction)
+            terms |= _truth_terms(batch.truth, prediction, batch.truth_is_sparse)
+        if prediction.novel is not None:
+            terms |= _novel_terms(batch, prediction.depth, prediction.novel, config)
         return ObjectiveValue(per_sample=_weighted_total(terms, config).mean(dim=1), terms=terms)
 
 
@@ -202,12 +222,13 @@ def _self_supervised_terms(
     if config.corrected:
         batch = _with_binary_masks(batch)
     views = synthesise_views(batch, prediction, config)
+    batch = _compared(batch, prediction, config)
     errors = _masked_errors(batch, prediction, views, config, identity_noise)
     terms = {name: weighted_mean(*_added_up(part.sums() for part in parts)) for name, parts in errors.items()}
     if "reconstruction_consistency" in terms:
         terms["reconstruction_consistency"] = terms["reconstruction_consistency"].mean(dim=1)
     if config.smoothness > 0:
-        shown = batch.masks if config.corrected else None
+        shown = batch.masks if config.corrected or config.leave_out_sky else None
         terms["smoothness"] = smoothness(prediction.disparity, batch.images, shown)
     if config.pose_consistency > 0:
         seen = motions_seen_from_anchor(prediction.motions, batch.base_T_camera, batch.anchor)
@@ -217,21 +238,29 @@ def _self_supervised_terms(
     return terms
 
 
-def _truth_terms(truth: Tensor, prediction: Prediction) -> dict[str, Tensor]:
+def _novel_terms(batch: RigBatch, depth: Tensor, novel: NovelViews, config: ObjectiveConfig) -> dict[str, Tensor]:
+    terms = {}
+    if config.synthesis_consistency > 0:
+        terms["synthesis_consistency"] = consistency_of_views(batch, depth, novel, config.corrected)
+    if config.synthesis_smoothness > 0:
+        terms["synthesis_smoothness"] = smoothness_of_views(novel.disparity)
+    return terms
+
+
+def _truth_terms(truth: Tensor, prediction: Prediction, is_sparse: bool) -> dict[str, Tensor]:
+    """Return the terms of truth; sparse truth tells neither outlines nor the sky."""
     errors = LogErrors.of(prediction.depth, truth)
-    terms = {
-        "truth": errors.mean(),
-        "truth_shape": errors.deviation(),
-        "truth_outlines": errors.of_steps(),
-        "truth_sky": sky_error(prediction.depth, prediction.sky, truth),
-    }
+    terms = {"truth": errors.mean(), "truth_shape": errors.deviation()}
+    if not is_sparse:
+        terms["truth_outlines"] = errors.of_steps()
+        terms["truth_sky"] = sky_error(prediction.depth, prediction.sky, truth)
     if prediction.log_uncertainty is not None:
         terms["truth_uncertainty"] = errors.surprise(prediction.log_uncertainty)
     return terms
 
 
 def _weighted_total(terms: Mapping[str, Tensor], config: ObjectiveConfig) -> Tensor:
-    weights = {"temporal": 1.0, **config.model_dump(include=set(terms))}
+    weights = config.model_dump(include=set(terms))
     return torch.stack([weights[name] * term for name, term in terms.items()]).sum(dim=0)
 
 
@@ -239,6 +268,18 @@ def _with_binary_masks(batch: RigBatch) -> RigBatch:
     binary = batch.to()
     binary.masks = (batch.masks >= 0.5).to(batch.masks)
     return binary
+
+
+def _compared(batch: RigBatch, prediction: Prediction, config: ObjectiveConfig) -> RigBatch:
+    """Return the batch with masks of the target's pixels that are compared.
+
+    Views are rendered before: what depth projects into the neighbour's sky is wrong, and has to be seen.
+    """
+    if not config.leave_out_sky or prediction.sky is None:
+        return batch
+    compared = batch.to()
+    compared.masks = batch.masks * (prediction.sky.detach() < 0).to(batch.masks)
+    return compared
 
 
 def synthesise_views(batch: RigBatch, prediction: Prediction, config: ObjectiveConfig) -> Views:
@@ -386,7 +427,7 @@ def masked_errors(
     Those of `reconstruction_consistency` are [B, F, N, 1, H, W]: the frames are averaged after the masked mean. Where
     no neighbour can be seen, the error of a term of the overlap is zero.
     """
-    errors = _masked_errors(batch, prediction, views, config, identity_noise)
+    errors = _masked_errors(_compared(batch, prediction, config), prediction, views, config, identity_noise)
     wholes = {name: _added_up(part.whole() for part in parts) for name, parts in errors.items()}
     return {name: (error, mask) for name, (error, mask) in wholes.items()}
 

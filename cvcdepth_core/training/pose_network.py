@@ -10,10 +10,13 @@ from typing import NamedTuple, get_args
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from cvcdepth_core.errors import CheckpointError
-from cvcdepth_core.networks import PoseNet
+from cvcdepth_core.networks import PoseNet, RigImages
 from cvcdepth_core.networks.checkpoint import Checkpoint, load_network_state
+from cvcdepth_core.networks.vfdepth import VolumePoseNet
+from cvcdepth_core.networks.volume import VolumeSpec
 from cvcdepth_core.rig.poses import Pose, inverse
 from cvcdepth_core.training.model import PoseMethod
 from cvcdepth_core.training.motion import motion_to_context
@@ -27,7 +30,7 @@ _LEAST_WAY = 0.1  # metres: shorter ones are told by noise
 class PoseAnswers:
     """A trained pose network, asked for the motion between two sets of pictures."""
 
-    def __init__(self, network: PoseNet, method: PoseMethod) -> None:
+    def __init__(self, network: PoseNet | VolumePoseNet, method: PoseMethod) -> None:
         self._network = network.eval()
         self._method = method
 
@@ -41,23 +44,47 @@ class PoseAnswers:
         if not checkpoint.pose_net:
             return None
         encoder, method = _described(checkpoint)
-        network = PoseNet(encoder)
+        network: PoseNet | VolumePoseNet = PoseNet(encoder)
+        if method == "volume":
+            network = VolumePoseNet(encoder, checkpoint.spec.volume or VolumeSpec())
         load_network_state(network, checkpoint.pose_net, origin=f"{checkpoint.path}: pose network")
         return cls(network, method)
 
     def later_T_earlier(  # noqa: N802
-        self, earlier: NDArray[np.uint8], later: NDArray[np.uint8], base_T_camera: NDArray[np.float64], anchor: int
+        self,
+        earlier: NDArray[np.uint8],
+        later: NDArray[np.uint8],
+        base_T_camera: NDArray[np.float64],
+        anchor: int,
+        intrinsics: NDArray[np.float64],
     ) -> Pose:
-        """Return the anchor camera's motion [4, 4] between two sets of pictures [N, H, W, 3] of cameras [N, 4, 4]."""
+        """Return the anchor camera's motion [4, 4] between two sets of pictures [N, H, W, 3] of N cameras.
+
+        Their poses have the ground at z = 0, `intrinsics` [N, 3, 3] are in pixels of the pictures.
+        """
         seen = [anchor] if self._method in ("front", "per_camera") else list(range(len(earlier)))
         views = [torch.from_numpy(frame[seen]).permute(0, 3, 1, 2).float()[None] / 255 for frame in (earlier, later)]
         with torch.inference_mode():
-            axis_angle, translation = self._network(*views)
+            if isinstance(self._network, VolumePoseNet):
+                axis_angle, translation = self._network(_rig_of(views[0], base_T_camera, intrinsics), views[1])
+            else:
+                axis_angle, translation = self._network(*views)
             motion: Pose = motion_to_context(axis_angle, translation, backward=False)[0].double().numpy()
         if self._method != "joint":
             return motion
         seen_from_anchor: Pose = inverse(base_T_camera[anchor]) @ motion @ base_T_camera[anchor]
         return seen_from_anchor
+
+
+def _rig_of(images: Tensor, base_T_camera: NDArray[np.float64], intrinsics: NDArray[np.float64]) -> RigImages:
+    """Return images [1, N, 3, H, W] with their cameras, all of whose pixels show the scene."""
+    return RigImages(
+        images=images,
+        intrinsics=torch.from_numpy(intrinsics).float()[None],
+        base_T_camera=torch.from_numpy(base_T_camera).float()[None],
+        present=torch.ones(images.shape[:2], dtype=torch.bool),
+        masks=torch.ones_like(images[:, :, :1]),
+    )
 
 
 class MotionError(NamedTuple):
@@ -129,11 +156,16 @@ def pose_score_to_json(score: PoseScore | None) -> dict[str, float | None]:
     return {**score._asdict(), "ratio": score.ratio}
 
 
+def _method_of(checkpoint: Checkpoint) -> str:
+    """Return what a checkpoint that does not tell its configuration must be: released weights have none."""
+    return "volume" if any(key.startswith("birds_eye.") for key in checkpoint.pose_net) else "front"
+
+
 def _described(checkpoint: Checkpoint) -> tuple[str, PoseMethod]:
     """Return encoder and method."""
     try:
         pose = json.loads(checkpoint.metadata.get("config", "{}")).get("pose", {})
-        encoder, method = pose.get("encoder", checkpoint.spec.encoder), pose.get("method", "front")
+        encoder, method = pose.get("encoder", checkpoint.spec.encoder), pose.get("method", _method_of(checkpoint))
     except (ValueError, AttributeError) as error:
         raise CheckpointError(f"{checkpoint.path}: its metadata `config` is no configuration: {error}") from error
     if method not in get_args(PoseMethod):

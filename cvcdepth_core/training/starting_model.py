@@ -14,6 +14,8 @@ from cvcdepth_core.networks.checkpoint import Checkpoint, load_imagenet_encoder,
 from cvcdepth_core.networks.registry import DepthModelSpec
 from cvcdepth_core.networks.rig_conditioned import RigConditionedNet
 from cvcdepth_core.networks.rig_images import DepthNetwork
+from cvcdepth_core.networks.vfdepth import FusedDepthNet, VolumePoseNet
+from cvcdepth_core.networks.volume import VolumeSpec
 from cvcdepth_core.training.config import TrainingConfig
 from cvcdepth_core.training.model import SurroundModel
 
@@ -26,7 +28,7 @@ def build_surround_model(config: TrainingConfig, start: Checkpoint | None = None
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
-        depth_net, pose_net = build_depth_network(config.depth), PoseNet(config.pose.encoder)
+        depth_net, pose_net = build_depth_network(config.depth), build_pose_network(config)
     if start is not None:
         _refuse_other_meaning(start, config)
         load_network_state(depth_net, start.depth_net, origin=f"{start.path}: depth network")
@@ -50,17 +52,24 @@ def build_imagenet_model(config: TrainingConfig, classifier: Path, initial_depth
         )
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
-        depth_net, pose_net = build_depth_network(config.depth), PoseNet(config.pose.encoder)
-    if not isinstance(depth_net, (DepthNet, RigConditionedNet)):
+        depth_net, pose_net = build_depth_network(config.depth), build_pose_network(config)
+    if not isinstance(depth_net, (DepthNet, RigConditionedNet, FusedDepthNet)):
         raise ConfigError(f"depth.network is {config.depth.network}, which has no encoder that ImageNet could start")
     for encoder in (depth_net.depth_encoder, pose_net.pose_encoder):
         load_imagenet_encoder(encoder, classifier)
-    if isinstance(depth_net, DepthNet):
+    if isinstance(depth_net, (DepthNet, FusedDepthNet)):
         _start_at_depth(depth_net, config.depth, initial_depth)
     return _surround_model(config, depth_net, pose_net)
 
 
-def _start_at_depth(depth_net: DepthNet, spec: DepthModelSpec, metres: float) -> None:
+def build_pose_network(config: TrainingConfig) -> PoseNet | VolumePoseNet:
+    """Return the pose network of `config` with random weights."""
+    if config.pose.method == "volume":
+        return VolumePoseNet(config.pose.encoder, config.depth.volume or VolumeSpec())
+    return PoseNet(config.pose.encoder)
+
+
+def _start_at_depth(depth_net: DepthNet | FusedDepthNet, spec: DepthModelSpec, metres: float) -> None:
     """Set the head's bias so that a camera with fx = focal_scale begins near a depth of `metres`."""
     if not spec.min_depth < metres < spec.max_depth:
         raise ConfigError(f"initial depth is {metres}, expected between {spec.min_depth} and {spec.max_depth}")
@@ -69,7 +78,9 @@ def _start_at_depth(depth_net: DepthNet, spec: DepthModelSpec, metres: float) ->
     torch.nn.init.constant_(bias, math.log(disparity / (1 - disparity)))
 
 
-def _surround_model(config: TrainingConfig, depth_net: DepthNetwork, pose_net: PoseNet) -> SurroundModel:
+def _surround_model(
+    config: TrainingConfig, depth_net: DepthNetwork, pose_net: PoseNet | VolumePoseNet
+) -> SurroundModel:
     return SurroundModel(
         depth_net,
         pose_net,
@@ -88,6 +99,7 @@ def _refuse_other_meaning(start: Checkpoint, config: TrainingConfig) -> None:
         ("encoder", start.spec.encoder),
         ("min_depth", start.spec.min_depth),
         ("max_depth", start.spec.max_depth),
+        ("volume", start.spec.volume),
         ("focal_scale", same_meaning),
     ):
         want = getattr(config.depth, name)

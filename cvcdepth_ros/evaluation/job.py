@@ -39,8 +39,9 @@ class EvaluationSettings(SkySettings, MatchingSettings, ModelSettings):
     """Score a reference that looks at no picture instead of a network: what any network must beat."""
     constant_depth: float = Field(10.0, gt=0, le=1e4)
     """Predictor constant only: metres."""
-    ground_height: float = Field(0.0, ge=-100, le=100)
-    """Predictor ground_plane only: the ground's z in the base frame, metres (-0.4 where that is at a car's axles)."""
+    ground_height: float | None = Field(None, ge=-100, le=100)
+    """The ground's z in the base frame, metres (-0.4 where that is at a car's axles), for flat ground and for networks
+    that are told their rig; without it the rig file's, else what LiDAR or pictures show, else 0."""
     min_depth: float = Field(0.0, ge=0, le=1e4)
     """Metres; truth at or below it is left out, predictions are clamped to it."""
     max_depth: float = Field(80.0, gt=0, le=1e4)
@@ -118,7 +119,7 @@ class EvaluationSettings(SkySettings, MatchingSettings, ModelSettings):
         if self.predictor == "constant":
             return constant_depth(rig, self.constant_depth, self.height, self.width)
         if self.predictor == "ground_plane":
-            return ground_plane_depth(rig, self.ground_height, self.max_depth, self.height, self.width)
+            return ground_plane_depth(rig, rig.ground_z, self.max_depth, self.height, self.width)
         return self.build_estimator()
 
 

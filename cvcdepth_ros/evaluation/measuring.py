@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from cvcdepth_core.errors import RecordingError
-from cvcdepth_core.estimator import DepthPredictor
+from cvcdepth_core.estimator import DepthPredictor, is_told_its_rig
 from cvcdepth_core.rendering.agreement import PosedDepth
 from cvcdepth_core.rig.poses import Pose
 from cvcdepth_core.rig.view import PicturePart
@@ -36,6 +36,7 @@ from cvcdepth_ros.evaluation.job import EvaluationJob
 from cvcdepth_ros.evaluation.pose_scores import PoseScoring
 from cvcdepth_ros.evaluation.references import ReferenceScores, ReferenceScoring
 from cvcdepth_ros.messages.cloud_sources import describe_left_out_clouds
+from cvcdepth_ros.recordings.ground import RecordedGround, with_ground
 from cvcdepth_ros.recordings.replay import DepthReplay, RecordedImage, SurroundReplay
 from cvcdepth_ros.recordings.rig import RecordedRig
 from cvcdepth_ros.recordings.true_depth import RecordedDepthImages
@@ -183,9 +184,20 @@ def _named(arrays: Mapping[str, NDArray[Any]], before: str) -> dict[str, NDArray
 class RecordingEvaluation:
     """One opened recording, ready to be measured; make it with `open_evaluation`."""
 
-    def __init__(self, job: EvaluationJob, recorded: RecordedRig, predictor: DepthPredictor | None = None) -> None:
-        """`predictor` is the job's where it is loaded already; without it, it is loaded here."""
+    def __init__(
+        self,
+        job: EvaluationJob,
+        recorded: RecordedRig,
+        predictor: DepthPredictor | None = None,
+        ground: RecordedGround | None = None,
+    ) -> None:
+        """`predictor` and `ground` are the job's and the rig's where they are known; else they are looked for here."""
         self.job = job
+        if predictor is None and job.settings.predictor is None:
+            predictor = job.settings.build_estimator()
+        if ground is None:
+            recorded, ground = _with_ground(job, recorded, predictor)
+        self.ground = ground
         self.replay = SurroundReplay(recorded, job.settings)
         self.truth = _truth(job, recorded)
         self.depths = DepthReplay(
@@ -235,7 +247,7 @@ class RecordingEvaluation:
 
         It is matched anew from shortly before it, by the rig and the network of this evaluation.
         """
-        anew = RecordingEvaluation(self.job, self.replay.recorded, self.depths.estimator)
+        anew = RecordingEvaluation(self.job, self.replay.recorded, self.depths.estimator, self.ground)
         before = _REFINED_BY_NS if self.depths.refinement.is_active else 2 * NANOSECONDS
         for measured in anew.sets(log_time - before, log_time + NANOSECONDS, stamp_ns):
             return measured
@@ -254,6 +266,14 @@ class RecordingEvaluation:
             lidar = self.truth.points(surround_set.time_ns)
             self.truth.forget_before(min(surround_set.times_ns.values()))
         return MeasuredSet(estimated, truth, poses, lidar, self.job.settings.sky)
+
+
+def _with_ground(
+    job: EvaluationJob, recorded: RecordedRig, network: DepthPredictor | None
+) -> tuple[RecordedRig, RecordedGround]:
+    """Look for the ground; in pictures, which takes seconds, only for depth that depends on it."""
+    depends = job.settings.predictor == "ground_plane" or (network is not None and is_told_its_rig(network))
+    return with_ground(recorded, job.lidar, job.settings.ground_height, with_pictures=depends)
 
 
 def _truth(job: EvaluationJob, recorded: RecordedRig) -> RecordedTruth | RecordedDepthImages:
@@ -406,6 +426,7 @@ def _summary(evaluation: RecordingEvaluation, scoring: _Scoring) -> dict[str, An
         "pose_network": scoring.poses.result(),
         "why_no_pose_network": scoring.poses.problem or None,
         "sky": scoring.sky.to_json(),
+        "ground": {**evaluation.ground.to_json(), "told_to_network": is_told_its_rig(depths.estimator)},
         "no_flat_ground": scoring.references.problem or None,
         "refused": depths.refused.reasons + replay.unreadable.reasons,
         "truth_refused": {"count": truth.refused.count, "reasons": truth.refused.reasons[:10]},

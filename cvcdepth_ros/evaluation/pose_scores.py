@@ -61,7 +61,8 @@ class PoseScoring:
             return None
         before, after = (poses[anchor] @ base_T_camera[anchor] for poses in (earlier.world_T_base, later.world_T_base))
         pictures = [one.estimated.result.pictures for one in (earlier, later)]
-        answer = network.later_T_earlier(pictures[0], pictures[1], base_T_camera, anchor)
+        intrinsics = later.estimated.result.intrinsics
+        answer = network.later_T_earlier(pictures[0], pictures[1], rig.poses_above_ground, anchor, intrinsics)
         return motion_error(answer, inverse(after) @ before)
 
 

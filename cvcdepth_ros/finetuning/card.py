@@ -51,6 +51,7 @@ def model_card(result: FinetuneResult) -> dict[str, Any]:
         "verdict": result.verdict.to_json(),
         "scores": {"before": _scores(result.before), "after": _scores(result.after)},
         "data": [_recording(result, i) for i in range(len(result.prepared.indexes))],
+        "worlds": _worlds(result),
         "left_out": result.prepared.left_out,
         "warnings": result.prepared.warnings,
         "rigs": _rigs(result.prepared.indexes),
@@ -77,7 +78,8 @@ def write_card(folder: Path, card: Mapping[str, Any]) -> None:
 
 def card_text(card: Mapping[str, Any]) -> str:
     """Return the card as Markdown; whatever comes from files is escaped."""
-    return "\n".join([*_head(card), *_score_lines(card["scores"]), *_data_lines(card), *_how_lines(card), ""])
+    parts = (_head(card), _score_lines(card["scores"]), _world_lines(card), _data_lines(card), _how_lines(card))
+    return "\n".join([*(line for part in parts for line in part), ""])
 
 
 def score_pairs(
@@ -106,6 +108,15 @@ def _scores(result: EvaluationResult | None) -> dict[str, Any] | None:
         return None
     held_out, cameras = nan_to_null(numbers_of(result)), camera_numbers(result)
     return {"held_out": held_out, "cameras": cameras, "pose_network": pose_score_to_json(result.pose_score)}
+
+
+def _worlds(result: FinetuneResult) -> dict[str, Any] | None:
+    if result.general is None:
+        return None
+    found = None if result.on_worlds is None else result.on_worlds.to_json()
+    if found is not None:
+        found |= {part: nan_to_null(found[part]) for part in ("before", "after", "difference")}
+    return {**result.general.to_json(), "scores": found}
 
 
 def _recording(result: FinetuneResult, number: int) -> dict[str, Any]:
@@ -186,6 +197,19 @@ def _score_lines(scores: Mapping[str, Any]) -> Iterator[str]:
     yield "needs no labels. A dash stands for what could not be measured."
     yield ""
     yield from pose_lines(scores)
+
+
+def _world_lines(card: Mapping[str, Any]) -> Iterator[str]:
+    worlds = card["worlds"]
+    if worlds is None:
+        return
+    yield "## Worlds"
+    yield ""
+    yield f"Beside the recordings, {worlds['views_per_step']} views of rendered worlds in each step, "
+    yield f"{worlds['share']:.0%} of the pictures, of {_plain(worlds['drives'])}: {worlds['training_views']} views."
+    if worlds["scores"] is not None:
+        yield f"The weights are {_plain(worlds['scores']['verdict'])}."
+    yield ""
 
 
 def _data_lines(card: Mapping[str, Any]) -> Iterator[str]:

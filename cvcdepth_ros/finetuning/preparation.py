@@ -20,6 +20,8 @@ from cvcdepth_ros.bags import Location, file_identities, open_recording
 from cvcdepth_ros.checks import CheckContext, CheckOptions, CheckResult, NumberedResult, run_checks
 from cvcdepth_ros.installation import package_version
 from cvcdepth_ros.kept import Arrays, KeptResults, document_array, read_document
+from cvcdepth_ros.recordings.ground import RecordedGround, recorded_ground
+from cvcdepth_ros.recordings.rig import RecordedRig
 from cvcdepth_ros.settings import MatchingSettings
 from cvcdepth_ros.training_data.index import RecordingIndex, ScaleSource, load_index
 from cvcdepth_ros.training_data.own_body_masks import find_self_occlusion, save_masks
@@ -30,7 +32,8 @@ NOT_NEEDED: Collection[str] = ("stamps", "LiDAR")
 COUNTED_HERE: Collection[str] = ("training", "pose network")
 """Checks of what a run finds out by itself, from the very recordings that are left."""
 
-_CHECKS_FOLDER, _INDEX_FOLDER, _MASKS_FOLDER, _FOUND_FILE = "checks", "index", "masks", "found.json"
+_CHECKS_FOLDER, _INDEX_FOLDER, _GROUND_FOLDER = "checks", "index", "ground"
+_MASKS_FOLDER, _FOUND_FILE = "masks", "found.json"
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,8 @@ class Source:
     """The vehicle's frame, where `layout` is None."""
     motion: MotionSource = "network"
     """`recordings.motion` of the configuration."""
+    needs_ground: bool = False
+    """Whether the network is told how high the ground lies."""
 
     @property
     def scale_from(self) -> ScaleSource:
@@ -82,6 +87,8 @@ def prepare(source: Source, run: Path) -> Prepared:
             index = load_index(
                 path, run / _INDEX_FOLDER, source.matching, source.layout, source.base_frame, source.scale_from
             )
+            if source.needs_ground:
+                index = _with_ground(index, source, run, prepared.warnings)
             prepared.indexes.append(index)
             prepared.warnings += [_describe_finding(path, problem) for problem in problems]
             prepared.warnings += [f"{path}: {loss}" for loss in index.losses]
@@ -92,6 +99,37 @@ def prepare(source: Source, run: Path) -> Prepared:
     if source.with_masks:
         _add_masks(prepared, run)
     return prepared
+
+
+def _with_ground(index: RecordingIndex, source: Source, run: Path, warnings: list[str]) -> RecordingIndex:
+    """Return the index with the ground's height in its rig; one that had to be found is told, and kept."""
+    if index.layout.ground_height is not None:
+        return index
+
+    def find() -> RecordedGround:
+        with open_recording(index.path) as recording:
+            return recorded_ground(RecordedRig.from_recording(recording, index.layout), source.lidar)
+
+    work = {
+        "version": package_version(),
+        "files": file_identities(index.path),
+        "lidar": source.lidar,
+        "rig": index.layout.model_dump(mode="json"),
+    }
+    kept = KeptResults(run / _GROUND_FOLDER, _ground_to_arrays, _ground_from_arrays)
+    ground = kept.load_or_make(str(index.path), work, find)
+    warnings.append(f"{index.path}: {ground.told}")
+    if ground.is_assumed:
+        return index
+    return replace(index, layout=index.layout.model_copy(update={"ground_height": ground.height}))
+
+
+def _ground_to_arrays(ground: RecordedGround) -> Arrays:
+    return {"ground": document_array(ground.to_json())}
+
+
+def _ground_from_arrays(arrays: Arrays) -> RecordedGround:
+    return RecordedGround.from_json(read_document(arrays["ground"]))
 
 
 def check_results(path: Location, source: Source, run: Path) -> list[NumberedResult]:
@@ -149,7 +187,7 @@ def _add_masks(prepared: Prepared, run: Path) -> None:
             replace(index, layout=masked) if index.layout == layout else index for index in prepared.indexes
         ]
         new = {camera.name: camera.mask for camera in masked.cameras if camera not in layout.cameras}
-        folder = f"{_digest(layout.model_dump_json())}/" if len(layouts) > 1 else ""
+        folder = f"{_rig_digest(layout)}/" if len(layouts) > 1 else ""
         prepared.found_masks |= {f"{folder}{name}": mask for name, mask in new.items() if mask is not None}
 
 
@@ -159,7 +197,7 @@ def _masked(index: RecordingIndex, run: Path, warnings: list[str]) -> RigLayout:
     Pictures, found again by the rig alone: whoever paints over one must not lose it to another version of the program.
     """
     layout = index.layout
-    folder = run / _MASKS_FOLDER / _digest(layout.model_dump_json())
+    folder = run / _MASKS_FOLDER / _rig_digest(layout)
     try:
         names = json.loads((folder / _FOUND_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -175,6 +213,11 @@ def _masked(index: RecordingIndex, run: Path, warnings: list[str]) -> RigLayout:
         for camera in layout.cameras
     ]
     return layout.model_copy(update={"cameras": tuple(cameras)})
+
+
+def _rig_digest(layout: RigLayout) -> str:
+    """Return a hash of the rig; a height that is not stated is taken for 0, so that it is as good as one of 0."""
+    return _digest(layout.model_copy(update={"ground_height": layout.ground_z}).model_dump_json())
 
 
 def _digest(text: str) -> str:

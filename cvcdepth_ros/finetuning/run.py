@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,19 +21,21 @@ from cvcdepth_core.training.starting_model import build_surround_model
 from cvcdepth_core.training.trainer import RunObserver, Trainer
 from cvcdepth_ros.evaluation.result import EvaluationResult
 from cvcdepth_ros.evaluation.trained_on import TrainedPart, to_metadata, trained_parts
+from cvcdepth_ros.finetuning.general import General, open_general
 from cvcdepth_ros.finetuning.held_out import HeldOutPart, evaluate_checkpoint, held_out_parts, validation_jobs
 from cvcdepth_ros.finetuning.judgement import Verdict, judge
 from cvcdepth_ros.finetuning.preparation import Prepared, Source, prepare
 from cvcdepth_ros.finetuning.provenance import inputs_of, trained_on
 from cvcdepth_ros.finetuning.tensorboard import TensorBoardObserver, has_tensorboard
 from cvcdepth_ros.finetuning.validation import CANDIDATE_FILE, HeldOutValidation
+from cvcdepth_ros.finetuning.world_scores import WorldVerdict, compare_worlds
 from cvcdepth_ros.installation import package_version
 from cvcdepth_ros.training_data.loader import RecordingBatches
 from cvcdepth_ros.training_data.sample_choice import describe_skipped_samples, describe_unprovable, held_out_sets
 
 START_FILE, BEST_FILE = "start.safetensors", "best.safetensors"
 
-_START_KEY = "start"
+_START_KEY, _WORLDS_KEY = "start", "worlds"
 _SCORES_FOLDER = "scores"
 
 
@@ -50,6 +53,8 @@ class FinetuneJob:
     quiet: bool = False
     with_promotion: bool = True
     """Whether `best.safetensors` is wanted: then a run is refused that could not prove its weights to be better."""
+    shards: Sequence[Path] = ()
+    """Shards of simulated drives that are learnt from and scored too, by `config.worlds`."""
 
     @property
     def started_from(self) -> str:
@@ -74,6 +79,10 @@ class FinetuneResult:
     after: EvaluationResult | None
     """The weights' scores there."""
     verdict: Verdict
+    general: General | None = None
+    """The worlds that were learned from too."""
+    on_worlds: WorldVerdict | None = None
+    """What happened to the depth of held-out worlds."""
 
 
 def fine_tune(job: FinetuneJob, processes: Processes, warn: Callable[[str], None]) -> FinetuneResult | None:
@@ -86,7 +95,8 @@ def fine_tune(job: FinetuneJob, processes: Processes, warn: Callable[[str], None
         prepared = prepare(job.source, job.run)
     if processes.is_first:
         _warn_of_losses(prepared, job, warn)
-    batches = RecordingBatches(prepared.indexes, job.config, processes)
+    batches = RecordingBatches(prepared.indexes, job.config, processes, job.source.lidar)
+    general = open_general(job.shards, batches, job.config, processes)
     if job.with_promotion:
         _refuse_unprovable(prepared, job.config.recordings)
     model = build_surround_model(job.config, job.start)
@@ -94,10 +104,10 @@ def fine_tune(job: FinetuneJob, processes: Processes, warn: Callable[[str], None
     parts = []
     if processes.is_first:
         parts = held_out_parts(prepared.indexes, job.config, str(device), job.source.lidar)
-    if parts:
+    if processes.is_first and (parts or general):
         _keep_start(job, model)  # before the trainer fills the model with what a former call reached
     observers = [TensorBoardObserver(job.run)] if processes.is_first and has_tensorboard() else []
-    trainer = _trainer(job, model, batches, parts, processes, observers, prepared)
+    trainer = _trainer(job, model, batches, parts, processes, observers, prepared, general)
     if processes.is_first and trainer.progress.step == 0:
         _forget_former_run(job.run)
     before = _evaluated(job, parts, job.run / START_FILE, "before") if parts else None
@@ -113,8 +123,24 @@ def fine_tune(job: FinetuneJob, processes: Processes, warn: Callable[[str], None
     weights, after, verdict = _judged(job, parts, before)
     if after is not None:
         _warn_of_pose_network(after, "the trained", prepared, warn)
+    on_worlds = _judged_on_worlds(job, general, weights, prepared, warn)
     samples = [sum(sample.recording == i for sample in batches.targets) for i in range(len(prepared.indexes))]
-    return FinetuneResult(job, prepared, trainer, samples, parts, weights, before, after, verdict)
+    return FinetuneResult(job, prepared, trainer, samples, parts, weights, before, after, verdict, general, on_worlds)
+
+
+def _judged_on_worlds(
+    job: FinetuneJob, general: General | None, weights: Path, prepared: Prepared, warn: Callable[[str], None]
+) -> WorldVerdict | None:
+    """Compare start and weights on all held-out worlds; warn, and keep the warning, where something is forgotten."""
+    scores = None if general is None else general.scores(own_device(resolve_device(job.device)))
+    if scores is None:
+        return None
+    found = compare_worlds(scores, scores.of_file(job.run / START_FILE), scores.of_file(weights))
+    if found.is_worse:
+        text = f"the weights are {found.describe()}; a larger worlds.share (--keep-general) forgets less"
+        prepared.warnings.append(text)
+        warn(text)
+    return found
 
 
 def _warn_of_losses(prepared: Prepared, job: FinetuneJob, warn: Callable[[str], None]) -> None:
@@ -160,25 +186,29 @@ def _trainer(
     processes: Processes,
     observers: list[TensorBoardObserver],
     prepared: Prepared,
+    general: General | None,
 ) -> Trainer:
     config = job.config
     learned_from = trained_on(prepared, config.recordings.held_out, job.start)
     watching: list[RunObserver] = [*observers]
+    device = own_device(resolve_device(job.device))
     validation = None
     if parts:
         jobs = validation_jobs(parts, config.evaluation.sets)
-        validation = HeldOutValidation(jobs, job.run, config.evaluation.patience)
+        worlds = None if general is None else general.scores(device, config.evaluation.sets)
+        validation = HeldOutValidation(jobs, job.run, config.evaluation.patience, worlds)
     return Trainer(
         config,
         model,
         batches,
         job.run,
-        own_device(resolve_device(job.device)),
+        device,
         validation,
-        _metadata(job, learned_from),
+        _metadata(job, learned_from) | ({} if general is None else {_WORLDS_KEY: json.dumps(general.to_json())}),
         watching,
         processes,
-        inputs_of(prepared, job.started_from),
+        inputs_of(prepared, job.started_from) | ({} if general is None else {"the worlds": general.identity}),
+        None if general is None else general.rehearsal,
     )
 
 

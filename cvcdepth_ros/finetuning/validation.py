@@ -11,6 +11,7 @@ from cvcdepth_core.training.trainer import Trainer, ValidationOutcome
 from cvcdepth_ros.evaluation.job import EvaluationJob
 from cvcdepth_ros.finetuning.held_out import evaluate_checkpoint
 from cvcdepth_ros.finetuning.judgement import numbers_of
+from cvcdepth_ros.finetuning.world_scores import ViewScores, mean_scores
 
 CANDIDATE_FILE = "candidate.safetensors"
 """The weights with the best validation since the start."""
@@ -21,10 +22,14 @@ _VALIDATED_FILE = ".validated.safetensors"
 class HeldOutValidation:
     """Scores the trainer's weights on some held-out sets, from the file that would be shipped."""
 
-    def __init__(self, jobs: Sequence[EvaluationJob], run: Path, patience: int | None) -> None:
+    def __init__(
+        self, jobs: Sequence[EvaluationJob], run: Path, patience: int | None, worlds: ViewScores | None = None
+    ) -> None:
+        """With `worlds`, these are scored too, which changes nothing but what is told."""
         self._jobs = jobs
         self._run = run
         self._patience = patience
+        self._worlds = worlds
 
     def __call__(self, trainer: Trainer) -> ValidationOutcome:
         """Return the scores, and whether to stop; the weights are kept if they are the best so far."""
@@ -39,6 +44,9 @@ class HeldOutValidation:
         else:
             path.unlink()
         scores = [*(other for _, other in earlier), score]
+        if self._worlds is not None:
+            on_worlds = mean_scores(self._worlds(trainer.result))
+            numbers |= {f"worlds_{name}": value for name, value in on_worlds.items()}
         return ValidationOutcome(numbers, stop=not is_start and self._has_waited_enough(scores))
 
     def _has_waited_enough(self, scores: Sequence[float]) -> bool:

@@ -26,6 +26,8 @@ from cvcdepth_ros.messages.conversion import stamp_ns
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
 from cvcdepth_ros.node.diagnostics import (
     camera_status,
+    ground_plane_status,
+    ground_problem,
     ground_status,
     inference_status,
     model_status,
@@ -114,6 +116,7 @@ class SurroundSession:
             self._opened = opened.pop_all()
         for line in unknown_qos_overrides(node, self._inputs.image_topics):
             node.get_logger().warning(line)
+        self._warn_of_unstated_ground()
 
     def _rig_transforms(self, opened: ExitStack) -> RigTransforms | None:
         """Return what publishes poses that only the rig has; None where there are none, or without tf2_msgs."""
@@ -143,6 +146,7 @@ class SurroundSession:
         """Use another network from the next set on; EngineError when it cannot run."""
         self._pipeline.set_model(estimator)
         self._estimator = estimator
+        self._warn_of_unstated_ground()
         self._monitored_rig = None  # what was usual for the former network need not be for this one
 
     def resume_listening(self) -> None:
@@ -222,10 +226,16 @@ class SurroundSession:
                 self.latencies.summaries(), mailbox, self.problem, self._estimator.model_id, self.unknown_latencies
             ),
             model_status(self._estimator),
+            *([ground_status(self._assembler.layout)] if self._estimator.spec.is_told_its_rig else []),
             *([overlap_status(self._overlaps)] if self._overlaps else []),
-            *([ground_status(self._outputs.ground)] if self._outputs.ground else []),
+            *([ground_plane_status(self._outputs.ground)] if self._outputs.ground else []),
             *([refinement_status(self._refinement, self._motion.poses)] if self._refinement.is_active else []),
         ]
+
+    def _warn_of_unstated_ground(self) -> None:
+        problem = ground_problem(self._assembler.layout)
+        if problem and self._estimator.spec.is_told_its_rig:
+            self._node.get_logger().warning(problem)
 
     def _setup_troubles(self, camera: str) -> list[Trouble]:
         """Return what the camera still lacks before its images can be used."""

@@ -61,6 +61,9 @@ def held_out_curves(log: RunLog) -> Figure:
     """Draw the scores of the validations over the steps."""
     figure, (score, others) = dark_figure(13, 5.2, rows=2)
     _points(score, log.validations, "score", BLUE)
+    if any("worlds_abs_rel" in entry["validation"] for entry in log.validations):
+        _points(score, log.validations, "worlds_abs_rel", GREEN)
+        add_legend(score)
     for name, colour in (("spatial_photometric", YELLOW), ("temporal_photometric", GREEN), ("spatial", RED)):
         _points(others, log.validations, name, colour)
     add_title(score, "score that weights are chosen by, on some held-out sets (lower is better)")

@@ -103,7 +103,7 @@ class MergedProducts:
     @cached_property
     def separated(self) -> SeparatedCloud:
         """Ground and obstacles."""
-        return separate(self._whole, self._rig.ground_height, self._limits.obstacles)
+        return separate(self._whole, self._rig.ground_z, self._limits.obstacles)
 
     @cached_property
     def _whole(self) -> Cloud:

@@ -11,14 +11,19 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from torch import Tensor
 from torch.utils.data import DataLoader
 
 from cvcdepth_core.errors import RecordingError, RigError
+from cvcdepth_core.networks.registry import DepthModelSpec
+from cvcdepth_core.networks.volume import refuse_cameras_outside
 from cvcdepth_core.rig.ground import refuse_unlikely_ground
 from cvcdepth_core.training.batch import RigBatch
 from cvcdepth_core.training.config import RecordingsConfig, TrainingConfig
 from cvcdepth_core.training.distributed import SINGLE_PROCESS, Processes
 from cvcdepth_ros.training_data.index import RecordingIndex
+from cvcdepth_ros.training_data.recorded_truth import TruthSource, truth_sources
 from cvcdepth_ros.training_data.sample_choice import (
     Sample,
     find_variants,
@@ -52,15 +57,20 @@ class RecordingBatches:
     """
 
     def __init__(
-        self, indexes: Sequence[RecordingIndex], config: TrainingConfig, processes: Processes = SINGLE_PROCESS
+        self,
+        indexes: Sequence[RecordingIndex],
+        config: TrainingConfig,
+        processes: Processes = SINGLE_PROCESS,
+        lidar: tuple[str, ...] | None = None,
     ) -> None:
         """Find the samples; RecordingError names recording and values when there are none.
 
-        RigError names recording and camera where the network is told a rig that cannot be right about the ground.
+        `lidar` names the LiDARs' topics, of which truth is made (None: those of each recording). RigError names
+        recording and camera where the network is told a rig that cannot be right about the ground, or where its volume
+        does not contain the camera.
         """
         _refuse_unrecorded_motion(indexes, config.recordings)
-        if config.depth.is_told_its_rig:
-            _refuse_unlikely_ground(indexes)
+        _refuse_impossible_rigs(indexes, config.depth)
         refuse_standstill(indexes, config.recordings)
         variants = [
             of_target
@@ -68,12 +78,14 @@ class RecordingBatches:
             for of_target in find_variants(index, config.recordings, recording)
         ]
         every = [sample for of_target in variants for sample in of_target]
-        self.reader = SampleReader(indexes, every, config.depth.height, config.depth.width, config.recordings)
+        size = config.depth.height, config.depth.width
+        sources = truth_sources(indexes, config.recordings, lidar)
+        self.reader = SampleReader(indexes, every, *size, config.recordings, sources, lidar)
         self.targets = [of_target[0] for of_target in variants]
         """The samples of an epoch, each with its nearest contexts."""
         ends = np.cumsum([len(of_target) for of_target in variants])
         self._variants = [range(end - len(of_target), end) for of_target, end in zip(variants, ends, strict=True)]
-        self._rig_groups = _group_by_rig(indexes, self.targets, config.recordings)
+        self._rig_groups = _group_by_rig(indexes, self.targets, config.recordings, sources)
         self._processes = processes
         self._samples_together = config.optimizer.samples_per_batch * processes.count
         self._seed = config.seed
@@ -87,6 +99,11 @@ class RecordingBatches:
     def samples(self) -> int:
         """Samples of one epoch, of all processes together."""
         return len(self.targets)
+
+    @property
+    def cameras_per_sample(self) -> float:
+        """Pictures whose depth is learnt in a sample, mean over the samples of an epoch."""
+        return float(np.mean([len(self.reader.rigs[sample.recording].names) for sample in self.targets]))
 
     def epoch(self, number: int, first: int = 0) -> Iterator[RigBatch | None]:
         """Yield the batches of an epoch from the `first` on; None for one whose images are all damaged."""
@@ -122,10 +139,14 @@ def _refuse_unrecorded_motion(indexes: Sequence[RecordingIndex], config: Recordi
             )
 
 
-def _refuse_unlikely_ground(indexes: Sequence[RecordingIndex]) -> None:
+def _refuse_impossible_rigs(indexes: Sequence[RecordingIndex], spec: DepthModelSpec) -> None:
     for index in indexes:
+        rig = index.layout.complete()
         try:
-            refuse_unlikely_ground(index.layout.complete())
+            if spec.is_told_its_rig:
+                refuse_unlikely_ground(rig)
+            if spec.volume is not None:
+                refuse_cameras_outside(spec.volume, rig.poses_above_ground, rig.names)
         except RigError as error:
             raise RigError(f"{index.path}: {error}") from error
 
@@ -136,10 +157,16 @@ def _at_least(samples: list[int], count: int) -> list[int]:
 
 
 def _group_by_rig(
-    indexes: Sequence[RecordingIndex], samples: Sequence[Sample], config: RecordingsConfig
+    indexes: Sequence[RecordingIndex],
+    samples: Sequence[Sample],
+    config: RecordingsConfig,
+    sources: Sequence[TruthSource | None],
 ) -> list[list[int]]:
-    """Return the samples' positions, those of equal rigs and of motion from the same source together."""
-    kinds = [(index.layout, takes_recorded_motion(index, config)) for index in indexes]
+    """Return the samples' positions, those of equal rigs and of motion and truth from the same source together."""
+    kinds = [
+        (index.layout, takes_recorded_motion(index, config), source)
+        for index, source in zip(indexes, sources, strict=True)
+    ]
     groups: dict[int, list[int]] = {}
     for position, sample in enumerate(samples):
         groups.setdefault(kinds.index(kinds[sample.recording]), []).append(position)
@@ -154,7 +181,7 @@ def _loader(reader: SampleReader, order: _EpochOrder, workers: int) -> DataLoade
         persistent_workers=workers > 0,
         # A forked worker inherits locks that a thread of OpenCV, torch or fsspec may hold, and then waits for ever.
         multiprocessing_context="spawn" if workers else None,
-        collate_fn=partial(_collate, reader.rigs),
+        collate_fn=partial(_collate, reader.rigs, reader.truth_sources),
         worker_init_fn=_one_thread,
     )
 
@@ -165,11 +192,24 @@ def _one_thread(_: int) -> None:
     torch.set_num_threads(1)
 
 
-def _collate(rigs: Sequence[NetworkRig], items: Sequence[ReadSample | None]) -> RigBatch | None:
+def _collate(
+    rigs: Sequence[NetworkRig], sources: Sequence[TruthSource | None], items: Sequence[ReadSample | None]
+) -> RigBatch | None:
     read = [item for item in items if item is not None]
     if not read:
         return None
-    recordings, *columns = zip(*read, strict=True)
+    recordings, pictures, poses, delays, times, recorded_poses, truth = zip(*read, strict=True)
     rig: NetworkRig = rigs[recordings[0]]
-    known = [column for column in columns if column[0] is not None]  # recorded poses, the last, may be unknown to all
-    return rig.batch(*(torch.from_numpy(np.stack(column)) for column in known))
+    return rig.batch(
+        _stacked(pictures),
+        _stacked(poses),
+        _stacked(delays),
+        _stacked(times),
+        None if recorded_poses[0] is None else _stacked(recorded_poses),
+        None if truth[0] is None else _stacked(truth),
+        truth_is_sparse=sources[recordings[0]] == "lidar",
+    )
+
+
+def _stacked(column: Sequence[NDArray[Any]]) -> Tensor:
+    return torch.from_numpy(np.stack(column))

@@ -28,6 +28,7 @@ from cvcdepth_ros.messages.conversion import stamp_ns
 from cvcdepth_ros.recently_used import RecentlyUsed
 from cvcdepth_ros.surround_sets.set_estimation import images_of
 from cvcdepth_ros.training_data.index import RecordingIndex
+from cvcdepth_ros.training_data.recorded_truth import TruthReader, TruthSource
 from cvcdepth_ros.training_data.sample_choice import Sample, takes_recorded_exposures, takes_recorded_motion
 
 
@@ -44,6 +45,13 @@ class NetworkRig:
     pairs: tuple[tuple[int, int], ...]
     """(camera, neighbour)."""
 
+    @property
+    def poses_above_ground(self) -> NDArray[np.float64]:
+        """`base_T_camera` [N, 4, 4] with the ground at z = 0."""
+        poses: NDArray[np.float64] = self.base_T_camera.copy()
+        poses[:, 2, 3] -= self.ground_height
+        return poses
+
     @classmethod
     def from_index(cls, index: RecordingIndex, height: int, width: int) -> NetworkRig:
         """Prepare the rig of a recording; RigError names a mask that does not fit."""
@@ -53,7 +61,7 @@ class NetworkRig:
             tuple(rig.names),
             index.anchor,
             np.stack([camera.base_T_camera for camera in rig.cameras]),
-            rig.ground_height,
+            rig.ground_z,
             tuple(rig.neighbour_indices),
         )
 
@@ -64,11 +72,13 @@ class NetworkRig:
         delays: Tensor,
         context_times: Tensor,
         recorded_poses: Tensor | None = None,
+        truth: Tensor | None = None,
+        truth_is_sparse: bool = False,
     ) -> RigBatch:
         """Join what samples have of their own with the rig's constants.
 
-        That is pictures (uint8 [B, 3, N, H, W, 3], target first), poses [B, N, 4, 4], times and recorded poses of
-        `ReadSample`. The batch's poses have the ground at z = 0.
+        That is pictures (uint8 [B, 3, N, H, W, 3], target first), poses [B, N, 4, 4], times, recorded poses and truth
+        of `ReadSample`. The batch's poses have the ground at z = 0; its truth is unknown where the masks are 0.
         """
         samples = len(frames)
         masks = torch.from_numpy(self.preprocessor.valid).float()[:, None]
@@ -87,6 +97,8 @@ class NetworkRig:
             exposure_delays=delays.float() if bool(delays.any()) else None,
             context_times=context_times.float(),
             recorded_poses=None if recorded_poses is None else recorded_poses.float(),
+            truth=None if truth is None else torch.where(masks > 0, truth[:, :, None].float(), torch.nan),
+            truth_is_sparse=truth_is_sparse,
         )
 
 
@@ -105,6 +117,8 @@ class ReadSample(NamedTuple):
     recorded_poses: NDArray[np.float64] | None
     """[3, N, 4, 4] each camera's at target, before and after, in the base frame at the anchor's target exposure; None
     where the losses take the pose network's motion."""
+    truth: NDArray[np.float32] | None
+    """[N, H, W] metres at the target; inf in the sky, NaN where it is not known; None where none is learnt from."""
 
 
 class SampleReader(Dataset[ReadSample | None]):
@@ -120,13 +134,20 @@ class SampleReader(Dataset[ReadSample | None]):
         height: int,
         width: int,
         config: RecordingsConfig,
+        truth_sources: Sequence[TruthSource | None] = (),
+        lidar: tuple[str, ...] | None = None,
     ) -> None:
+        """`truth_sources` are those of each recording, without any there is no truth; `lidar` names LiDARs' topics."""
         self.samples = list(samples)
         self.rigs = [NetworkRig.from_index(index, height, width) for index in indexes]
         self._indexes = list(indexes)
         self._config = config
         self._cache: RecentlyUsed[tuple[int, int], NDArray[np.uint8]] = RecentlyUsed(config.cache_mb * 2**20)
         self._recordings: dict[int, Recording] = {}
+        self.truth_sources = list(truth_sources) or [None] * len(indexes)
+        self._lidar = lidar
+        self._truth_readers: dict[int, TruthReader] = {}
+        self._true_depth: RecentlyUsed[tuple[int, int], NDArray[np.float32]] = RecentlyUsed(config.cache_mb * 2**20)
 
     def __len__(self) -> int:
         return len(self.samples)
@@ -138,9 +159,9 @@ class SampleReader(Dataset[ReadSample | None]):
         except ImageError:
             return None
         poses = self.camera_poses(sample.recording, sample.target)
-        return ReadSample(
-            sample.recording, np.stack(frames), poses, *self.exposures(sample), self.recorded_poses(sample)
-        )
+        exposures, recorded_poses = self.exposures(sample), self.recorded_poses(sample)
+        truth = self.truth(sample.recording, sample.target)
+        return ReadSample(sample.recording, np.stack(frames), poses, *exposures, recorded_poses, truth)
 
     def pictures(self, recording: int, row: int) -> NDArray[np.uint8]:
         """Return the rectified pictures [N, H, W, 3] of a set; ImageError names the camera of a damaged one."""
@@ -149,6 +170,21 @@ class SampleReader(Dataset[ReadSample | None]):
             pictures = np.stack(list(self._rectified(recording, row)))
             self._cache.put((recording, row), pictures, pictures.nbytes)
         return pictures
+
+    def truth(self, recording: int, row: int) -> NDArray[np.float32] | None:
+        """Return the true depth [N, H, W] of a set as `ReadSample` has it; None where none is learnt from."""
+        source = self.truth_sources[recording]
+        if source is None:
+            return None
+        truth = self._true_depth.get((recording, row))
+        if truth is None:
+            if recording not in self._truth_readers:
+                opened, index = self._open(recording), self._indexes[recording]
+                self._truth_readers[recording] = TruthReader(index, opened, source, self._lidar)
+            height, width = self.rigs[recording].preprocessor.valid.shape[1:]
+            truth = self._truth_readers[recording].read(row, height, width)
+            self._true_depth.put((recording, row), truth, truth.nbytes)
+        return truth
 
     def camera_poses(self, recording: int, row: int) -> NDArray[np.float64]:
         """Return each camera's pose [N, 4, 4] at its own exposure, in the base frame at the anchor's.

@@ -19,9 +19,12 @@ from cvcdepth_core.rig.rig import Camera
 from cvcdepth_core.training.batch import RigBatch
 from cvcdepth_core.training.config import TrainingConfig, WorldsConfig
 from cvcdepth_core.training.distributed import SINGLE_PROCESS, Processes
+from cvcdepth_core.training.trainer import RehearsedBatch
 from cvcdepth_core.worlds.shards import SUFFIX, Shard
 
 _NAME = "view"  # of the only camera of a sample
+_OF_EPOCHS, _OF_REHEARSAL = 1, 2
+"""Tell the draws of windows apart."""
 
 
 class View(NamedTuple):
@@ -64,7 +67,7 @@ class ViewReader:
         self.height, self.width = height, width
         self._shards = [Shard(path) for path in paths]
         self._cameras = [shard.layout.complete().cameras for shard in self._shards]
-        self._ground_heights = [shard.layout.ground_height for shard in self._shards]
+        self._ground_heights = [shard.layout.ground_z for shard in self._shards]
         self.views = [
             View(i, number, camera)
             for i, shard in enumerate(self._shards)
@@ -136,11 +139,7 @@ class WorldBatches:
 
     def __init__(self, paths: Sequence[Path], config: TrainingConfig, processes: Processes = SINGLE_PROCESS) -> None:
         """ConfigError when no drive is left to train on; RecordingError names a damaged shard."""
-        kept = len(paths) - math.ceil(config.worlds.held_out * len(paths))
-        if kept < 1:
-            raise ConfigError(f"worlds.held_out is {config.worlds.held_out}: of {len(paths)} drives none is left")
-        self.reader = ViewReader(paths[:kept], config.depth.height, config.depth.width)
-        self.held_out = ViewReader(paths[kept:], config.depth.height, config.depth.width)
+        self.reader, self.held_out = read_drives(paths, config)
         self._config = config.worlds
         self._seed = config.seed
         self._processes = processes
@@ -160,14 +159,87 @@ class WorldBatches:
             yield self._batch(mine[: max(1, math.ceil(len(chosen) / self._processes.count))], number)
 
     def _batch(self, chosen: Sequence[int], epoch: int) -> RigBatch | None:
-        views = []
-        for item in chosen:
-            rng = np.random.default_rng([self._seed, epoch, item, 1])
-            try:
-                views.append(self.reader.read(self.reader.views[item], self._config, rng))
-            except RecordingError:
-                continue
-        return batch_of_views(views) if views else None
+        drawn = [(item, np.random.default_rng([self._seed, epoch, item, _OF_EPOCHS])) for item in chosen]
+        return _batch(self.reader, self._config, drawn)
+
+
+class WorldRehearsal:
+    """The views of worlds that a training on recordings learns from too, as many in every step.
+
+    They are every view once in a random order, then all in another one, and so on; which ones a step has depends on
+    the seed and its number only.
+    """
+
+    name = "worlds"
+
+    def __init__(
+        self,
+        reader: ViewReader,
+        config: TrainingConfig,
+        cameras: float,
+        processes: Processes = SINGLE_PROCESS,
+    ) -> None:
+        """Take views from `reader` beside samples of recordings that have `cameras` pictures each, on average.
+
+        ConfigError when there is not a view for every process.
+        """
+        self.views_per_step = views_per_step(config, cameras)
+        self.weight = config.worlds.weight / cameras
+        if self.views_per_step < processes.count:
+            raise ConfigError(
+                f"worlds.share is {config.worlds.share}: that is {self.views_per_step} views in each step, fewer than "
+                f"the {processes.count} processes"
+            )
+        self._reader, self._config, self._seed = reader, config.worlds, config.seed
+        self._processes = processes
+        # About as many pictures go through the networks together as of recordings.
+        together = max(2, round(config.optimizer.samples_per_batch * cameras)) * processes.count
+        self._parts = math.ceil(self.views_per_step / together)
+
+    def of_step(self, number: int) -> Iterator[RehearsedBatch]:
+        """See `Rehearsal`."""
+        places = np.arange(number * self.views_per_step, (number + 1) * self.views_per_step)
+        for part in np.array_split(places, self._parts):
+            mine = part[self._processes.rank :: self._processes.count].tolist()
+            batch = _batch(self._reader, self._config, [self._drawn(place) for place in mine])
+            yield RehearsedBatch(int(part[0] - places[0]), batch)
+
+    def _drawn(self, place: int) -> tuple[int, np.random.Generator]:
+        """Return the view at a place of the endless order, and what its window is drawn with."""
+        turn, within = divmod(place, len(self._reader.views))
+        item = int(np.random.default_rng([self._seed, turn]).permutation(len(self._reader.views))[within])
+        return item, np.random.default_rng([self._seed, turn, item, _OF_REHEARSAL])
+
+
+def views_per_step(config: TrainingConfig, cameras: float) -> int:
+    """Return how many views of worlds come with a step's samples of recordings, of `cameras` pictures each."""
+    share = config.worlds.share
+    return max(1, round(share / (1 - share) * config.optimizer.samples_per_step * cameras)) if share else 0
+
+
+def read_drives(paths: Sequence[Path], config: TrainingConfig) -> tuple[ViewReader, ViewReader]:
+    """Return the views that are trained on, and those of the last drives, which are held out.
+
+    ConfigError when no drive is left to train on; RecordingError names a damaged shard.
+    """
+    kept = len(paths) - math.ceil(config.worlds.held_out * len(paths))
+    if kept < 1:
+        raise ConfigError(f"worlds.held_out is {config.worlds.held_out}: of {len(paths)} drives none is left")
+    size = config.depth.height, config.depth.width
+    return ViewReader(paths[:kept], *size), ViewReader(paths[kept:], *size)
+
+
+def _batch(
+    reader: ViewReader, config: WorldsConfig, drawn: Sequence[tuple[int, np.random.Generator]]
+) -> RigBatch | None:
+    """Return a batch of views, by their numbers, with random windows; None where none can be read."""
+    views = []
+    for item, rng in drawn:
+        try:
+            views.append(reader.read(reader.views[item], config, rng))
+        except RecordingError:
+            continue
+    return batch_of_views(views) if views else None
 
 
 def batch_of_views(views: Sequence[WorldView]) -> RigBatch:

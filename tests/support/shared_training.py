@@ -13,11 +13,12 @@ from cvcdepth_core.training.batch import RigBatch
 from cvcdepth_core.training.config import OptimizerConfig, PoseConfig, TrainingConfig
 from cvcdepth_core.training.distributed import Processes, launched_processes
 from cvcdepth_core.training.starting_model import build_surround_model
-from cvcdepth_core.training.trainer import Trainer, ValidationOutcome
+from cvcdepth_core.training.trainer import RehearsedBatch, Trainer, ValidationOutcome
 
 SPEC = DepthModelSpec(encoder="efficientnet_lite0", height=64, width=64, min_depth=0.5, max_depth=80)
 SAMPLES = 8
 UNREADABLE = 5
+REHEARSED = 3
 
 
 class SharedBatches:
@@ -38,6 +39,33 @@ class SharedBatches:
             yield None if UNREADABLE in together else batch
 
 
+class SharedRehearsal:
+    """Three single views with truth in every step, one of which a second process takes."""
+
+    name, weight = "worlds", 0.4
+
+    def __init__(self, processes: Processes) -> None:
+        self._processes = processes
+
+    def of_step(self, number: int) -> Iterator[RehearsedBatch]:
+        """Give this process's part of a step."""
+        torch.manual_seed(5000 + number)
+        whole = random_batch(REHEARSED, 3, SPEC.height, SPEC.width)
+        truth = 1 + 20 * torch.rand_like(whole.masks)
+        mine = slice(self._processes.rank, None, self._processes.count)
+        views = RigBatch(
+            whole.frames[mine, :1, :1],
+            whole.masks[mine, :1],
+            whole.intrinsics[mine, :1],
+            whole.base_T_camera[mine, :1],
+            whole.targets[:0],
+            whole.sources[:0],
+            ("view",),
+            truth=truth[mine, :1],
+        )
+        yield RehearsedBatch(0, views)
+
+
 def train(run: Path, epochs: int, samples_per_batch: int, processes: Processes) -> None:
     """Train in float64, so that only a mistake can make two runs differ visibly."""
     config = TrainingConfig(
@@ -54,6 +82,7 @@ def train(run: Path, epochs: int, samples_per_batch: int, processes: Processes) 
         run,
         validate=lambda trainer: ValidationOutcome({"rank": processes.rank}, stop=len(trainer.validations) == 2),
         processes=processes,
+        rehearsal=SharedRehearsal(processes),
     )
     trainer.train(quiet=True)
 

@@ -5,7 +5,6 @@ float64 to 1e-9 of the greatest value, float32 to the tolerances of the README. 
 asserted to be what method.md says it is.
 """
 
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -13,6 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 import torch
+from golden_arrays import FLOAT64, GoldenArrays, assert_equal, assert_equal_each, assert_masks_equal, weight
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
@@ -51,27 +51,11 @@ LOSS_COLUMNS = [
     "reconstruction_consistency",
 ]
 RANGES = {"ddad": (1.5, 200.0), "nuscenes": (1.0, 80.0)}
-FLOAT64 = 1e-9
 DEPTH_FLOAT32, LOSS_FLOAT32, GRADIENT_FLOAT32 = 1e-4, 1e-5, 1e-4
 
 
-class Golden:
-    """One file of arrays; all of them together remember which outputs no test has looked at yet."""
-
+class Golden(GoldenArrays):
     unseen: ClassVar[dict[str, set[str]]] = {}
-
-    def __init__(self, path: Path) -> None:
-        with np.load(path, allow_pickle=False) as file:
-            self._arrays = {name: file[name] for name in file.files}
-        outputs = {name for name in self._arrays if name.startswith("out_")}
-        self._unseen = self.unseen.setdefault(path.name, outputs)
-
-    def __getitem__(self, name: str) -> NDArray[np.generic]:
-        self._unseen.discard(name)
-        return self._arrays[name]
-
-    def tensor(self, name: str, dtype: torch.dtype = torch.float64) -> Tensor:
-        return torch.tensor(self[name]).to(dtype)
 
 
 @pytest.fixture
@@ -81,44 +65,12 @@ def golden_dir(request: pytest.FixtureRequest) -> Path:
     return directory
 
 
-def assert_equal(ours: Tensor, golden: NDArray[np.generic], tolerance: float = FLOAT64) -> None:
-    ours = ours.detach().double().reshape(golden.shape)
-    expected = torch.tensor(golden).double()
-    worst = float((ours - expected).abs().max())
-    assert worst <= tolerance * float(expected.abs().max()), f"off by {worst}"
-
-
-def assert_equal_each(ours: Tensor, golden: NDArray[np.generic], tolerance: float = FLOAT64) -> None:
-    """Compare relative to each element, for arrays whose elements are of different kinds or sizes."""
-    torch.testing.assert_close(
-        ours.detach().double().reshape(golden.shape), torch.tensor(golden).double(), rtol=tolerance, atol=tolerance
-    )
-
-
-def assert_masks_equal(ours: Tensor, golden: NDArray[np.generic]) -> None:
-    different = int((ours.detach().double().reshape(golden.shape) != torch.tensor(golden)).sum())
-    assert different <= 2, f"{different} pixels of the mask differ"
-
-
 # --- a, b: the networks
 
 
 def define_weights(network: nn.Module) -> None:
     """Fill a network as the golden README defines its weights: by key."""
     network.load_state_dict({key: weight(key, value) for key, value in network.state_dict().items()})
-
-
-def weight(key: str, like: Tensor) -> Tensor:
-    z = np.random.RandomState(zlib.crc32(key.encode()) & 0x7FFFFFFF).standard_normal(tuple(like.shape))
-    if key.endswith("num_batches_tracked"):
-        z = np.zeros(())
-    elif key.endswith("running_var"):
-        z = 1 + 0.25 * np.abs(z)
-    elif like.ndim >= 2:
-        z = z * np.sqrt(1 / np.prod(like.shape[1:]))
-    else:
-        z = 1 + 0.1 * z if key.endswith("weight") else 0.1 * z
-    return torch.tensor(z).to(like.dtype)
 
 
 @pytest.mark.parametrize("kind", ["depth_net", "pose_net"])

@@ -274,7 +274,7 @@ def test_openvino_leaves_the_stack_of_signals_as_it_was():
         "before = stack()\n"
         "spec = DepthModelSpec(encoder='efficientnet_lite0', height=64, width=96, min_depth=1.5, max_depth=200.0)\n"
         "engine = OpenVinoEngine(DepthNet('efficientnet_lite0').eval(), spec)\n"
-        "engine._queue_for(torch.zeros(2, 3, 64, 96))\n"
+        "engine._queue_for({'images': torch.zeros(2, 3, 64, 96)})\n"
         "print(stack() == before)\n"
         "del engine; gc.collect()\n"
         "subprocess.run([sys.executable, '-c', ''], check=True)\n"

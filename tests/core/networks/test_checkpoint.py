@@ -17,6 +17,7 @@ from cvcdepth_core.networks.checkpoint import (
     load_checkpoint,
     load_imagenet_encoder,
     load_network_state,
+    load_spec,
     save_checkpoint,
 )
 from cvcdepth_core.networks.registry import DepthModelSpec
@@ -122,8 +123,15 @@ def write_unknown_encoder(path: Path) -> None:
 )
 def test_a_file_that_is_no_checkpoint_is_refused_by_name(checkpoint, damage, message):
     damage(checkpoint)
-    with pytest.raises(CheckpointError, match=rf"{checkpoint}.*{message}"):
+    with pytest.raises(CheckpointError, match=rf"{checkpoint}.*{message}") as told:
         load_checkpoint(checkpoint)
+    with pytest.raises(CheckpointError) as also_told:
+        load_spec(checkpoint)
+    assert str(also_told.value) == str(told.value)
+
+
+def test_what_it_is_for_can_be_read_alone(checkpoint):
+    assert load_spec(checkpoint) == load_checkpoint(checkpoint).spec
 
 
 def test_a_checkpoint_of_another_architecture_names_the_first_keys_and_their_count(tmp_path, depth_net):

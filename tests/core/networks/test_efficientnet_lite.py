@@ -99,7 +99,7 @@ def test_both_networks_take_the_encoder_and_train_all_of_it():
 
 def test_the_import_tool_makes_a_checkpoint_that_begins_at_the_initial_depth(golden, tmp_path):
     torch.save(imported_state(golden["names"], golden["shapes"]), tmp_path / "classifier.pth")
-    tool, config = ROOT / "tools" / "imagenet_checkpoint.py", ROOT / "config" / "training" / "finetune.yaml"
+    tool, config = ROOT / "tools" / "imagenet_checkpoint.py", ROOT / "config" / "training" / "default_model.yaml"
     out = tmp_path / "start.safetensors"
     subprocess.run(
         [sys.executable, tool, config, tmp_path / "classifier.pth", "-o", out, "--initial-depth", "5"],

@@ -11,10 +11,12 @@ import torch
 from pydantic import ValidationError
 from torch import Tensor
 
-from cvcdepth_core.engines import build_engine, is_installed
+from cvcdepth_core.engines import build_engine, is_installed, selection
 from cvcdepth_core.engines.engine import DisparityEngine
 from cvcdepth_core.engines.example_rigs import ring_of_cameras, ring_of_pictures
+from cvcdepth_core.engines.selection import choices_of_auto
 from cvcdepth_core.errors import ConfigError, ImageError
+from cvcdepth_core.estimator import DepthEstimator, PredictedDepth
 from cvcdepth_core.model_choices import BACKENDS
 from cvcdepth_core.networks import DepthModelSpec, RigImages, build_depth_network, disparity_to_depth
 from cvcdepth_core.networks.checkpoint import load_checkpoint, save_checkpoint
@@ -162,6 +164,39 @@ def test_every_engine_that_it_allows_gives_its_depth_for_every_rig_in_turn(netwo
         torch.testing.assert_close(engine.disparity(pictures).double(), wanted.detach(), rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.parametrize("backend", ENGINES)
+def test_every_engine_tells_the_sky_and_the_error_that_is_expected(network, backend: str):
+    pictures = ring_of_pictures(SPEC.height, SPEC.width)
+    found = build_engine(network, SPEC, "cpu", backend).details(pictures)
+    exact = copy.deepcopy(network).double().details(RigImages.from_pictures(pictures).to(dtype=torch.float64))
+    for one, wanted in zip(found, exact, strict=True):
+        assert wanted.std() > 1e-3
+        torch.testing.assert_close(one.double(), wanted[0].detach(), rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("fusion", ["none", "depth", "inverse_depth"])
+def test_the_estimator_tells_how_likely_each_pixel_is_sky(network, fusion: str):
+    pictures = ring_of_pictures(SPEC.height, SPEC.width)
+
+    def told(bias: float) -> PredictedDepth:
+        changed = with_bias(network, 2, bias)
+        return DepthEstimator(changed, SPEC, "toy", "cpu", "torch", flip_fusion=fusion).details(pictures)
+
+    for bias in (3.0, -3.0):
+        np.testing.assert_allclose(told(bias).sky, 1 / (1 + np.exp(-bias)), rtol=1e-5)
+    assert told(3.0).log_uncertainty.shape == told(3.0).depth.shape == pictures.valid.shape
+
+
+def test_auto_takes_the_best_of_its_engines_that_is_installed(network, monkeypatch):
+    cpu, cuda = torch.device("cpu"), torch.device("cuda")
+    assert set(choices_of_auto(network, SPEC, cpu)) == {name for name in network.engines if is_installed(name)}
+    assert choices_of_auto(network, SPEC, cuda)[0] == "torch"
+    assert choices_of_auto(network, SPEC, cuda)[-1] == "torch_eager"
+    monkeypatch.setattr(selection, "find_spec", lambda _: None)
+    assert choices_of_auto(network, SPEC, cpu) == ["torch", "torch_eager"]
+    assert build_engine(network, SPEC, "cpu").name.startswith("torch ")
+
+
 @pytest.mark.parametrize("backend", OTHERS)
 def test_every_other_engine_refuses_it_by_name(network, backend: str):
     with pytest.raises(ConfigError, match=f"backend {backend} cannot run the network rig_conditioned, efficientnet_li"):
@@ -182,10 +217,13 @@ def test_what_it_is_told_is_made_once_for_each_calibration(network, monkeypatch)
 
 
 def test_what_export_writes_down_is_enough_to_tell_it_a_rig(network, tmp_path):
+    onnxruntime = pytest.importorskip("onnxruntime")
     checkpoint = tmp_path / "model.safetensors"
     save_checkpoint(checkpoint, SPEC, network.state_dict())
     assert main(["export", str(checkpoint)]) == 0
     described = json.loads((tmp_path / "model.json").read_text())
+    session = onnxruntime.InferenceSession(tmp_path / "model.onnx")
+    assert [output.name for output in session.get_outputs()] == ["disparity", "sky", "log_uncertainty"]
     rig = ring_of_cameras(SPEC.height, SPEC.width).of_cameras([2])
     K, pose = rig.intrinsics[0, 0].double().numpy(), rig.base_T_camera[0, 0].double().numpy()
     v, u = np.mgrid[: SPEC.height, : SPEC.width]

@@ -10,7 +10,7 @@ from cvcdepth_core.errors import ConfigError
 from cvcdepth_core.rig.pinhole import PinholeView
 from cvcdepth_core.rig.view import PicturePart
 from cvcdepth_core.scoring import sparse_depth as sparse_depth_module
-from cvcdepth_core.scoring.ground_truth import overlap_pixels, sample_prediction, sparse_depth
+from cvcdepth_core.scoring.ground_truth import overlap_pixels, resized_truth, sample_prediction, sparse_depth
 from cvcdepth_core.scoring.sparse_depth import OcclusionFilter, SparseDepth
 
 K = np.array([[100.0, 0.0, 49.5], [0.0, 100.0, 39.5], [0.0, 0.0, 1.0]])
@@ -154,3 +154,23 @@ def test_overlap_is_what_a_neighbour_sees_too():
     assert seen.tolist() == [column <= border for column in range(100)]
     assert not overlap_pixels(truth, view(), []).any()
     assert not overlap_pixels(truth, view(), [view(turned=180.0)]).any()
+
+
+def test_truth_comes_to_another_size_at_its_pixels_centres_and_is_never_averaged():
+    rows, columns = np.divmod(np.arange(80 * 100), 100)
+    depth = 1.0 + np.arange(80 * 100)
+    dense = SparseDepth(rows, columns, depth, 80, 100)
+    small = resized_truth(dense, 16, 20)
+    assert np.array_equal(small, depth.reshape(80, 100)[2::5, 2::5].astype(np.float32))
+    part = PicturePart(10.0, 20.0, 50.0, 40.0)  # left, top, width, height
+    assert np.array_equal(resized_truth(dense, 40, 50, part), depth.reshape(80, 100)[20:60, 10:60].astype(np.float32))
+
+
+def test_of_sparse_truth_each_pixel_has_what_is_nearest_to_its_centre_the_sky_is_infinite_the_rest_unknown():
+    sky = np.array([[71, 41], [79, 99]])
+    truth = SparseDepth(np.array([0, 2, 70]), np.array([0, 3, 40]), np.array([5.0, 9.0, 7.0]), 80, 100, sky=sky)
+    small = resized_truth(truth, 16, 20)
+    assert small[0, 0] == 9.0
+    assert small[14, 8] == math.inf
+    assert small[15, 19] == math.inf
+    assert np.isnan(small).sum() == 16 * 20 - 3

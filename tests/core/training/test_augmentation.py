@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Colour jitter and coins: who shares a draw, what stays."""
+"""Colour jitter, coins and windows: who shares a draw, what stays, what follows."""
 
 import colorsys
 
 import torch
+from scenes import random_batch
 
 from cvcdepth_core.training.augmentation import (
     ColorJitterConfig,
@@ -14,7 +15,9 @@ from cvcdepth_core.training.augmentation import (
     apply_changes,
     draw_flips,
     jitter_colors,
+    zoom_in,
 )
+from cvcdepth_core.training.batch import RigBatch
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -73,3 +76,37 @@ def test_the_coin_is_fair_and_tossed_per_sample():
     flips = draw_flips([generator(seed) for seed in range(4000)])
     assert flips.dtype == torch.bool
     assert 0.45 < float(flips.float().mean()) < 0.55
+
+
+def slopes(batch: RigBatch) -> torch.Tensor:
+    """Slopes x / z and y / z of the ray through each pixel, [B, N, 2, H, W]."""
+    height, width = batch.frames.shape[-2:]
+    v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    rays = torch.linalg.inv(batch.intrinsics)[..., None, None, :, :] @ torch.stack([u, v, torch.ones_like(u)], -1)[
+        ..., None
+    ].to(batch.intrinsics)
+    return rays[..., :2, 0].movedim(-1, 2)
+
+
+def test_a_window_shows_with_its_calibration_what_the_picture_showed_in_that_direction():
+    batch = random_batch(2, 3, 32, 48)
+    low, span = slopes(batch).amin(), slopes(batch).amax() - slopes(batch).amin()
+    batch.frames[:, :, :, :2] = ((slopes(batch) - low) / span)[:, None]
+    batch.truth = 1 + batch.frames[:, 0, :, :1]
+    batch.truth[..., :4] = torch.nan
+    zoomed = zoom_in(batch, 1.5, [generator(3), generator(4)])
+    zooms = (zoomed.intrinsics / batch.intrinsics)[..., 0, 0]
+    assert 1.0 <= float(zooms.min()) < float(zooms.max()) <= 1.5
+    assert len(set(zooms.flatten().tolist())) == 6
+    expected = ((slopes(zoomed) - low) / span)[:, None].expand(-1, 3, -1, -1, -1, -1)
+    inner = (..., slice(1, -1), slice(1, -1))  # at the border of the picture there is nothing to interpolate with
+    torch.testing.assert_close(zoomed.frames[:, :, :, :2][inner], expected[inner])
+    known = torch.isfinite(zoomed.truth)
+    assert float((zoomed.truth[known] - 1 - zoomed.frames[:, 0, :, :1][known]).abs().max()) < 0.6 / 32
+    assert 0 < float(known.float().mean()) < 1
+    zoomed.__post_init__()  # is a batch as any
+
+
+def test_a_zoom_of_one_changes_nothing():
+    batch = random_batch(1, 3, 32, 48)
+    assert zoom_in(batch, 1.0, [generator()]) is batch

@@ -68,6 +68,16 @@ def test_two_processes_make_the_steps_of_one_with_twice_the_batch(alone, shared)
         assert other["terms"] == pytest.approx(one["terms"], rel=1e-9)
 
 
+def test_every_step_rehearses_and_tells_its_terms_apart(shared):
+    for entry in log_of(shared, "loss"):
+        assert {"temporal", "spatial"} < set(entry["terms"])
+        assert {name for name in entry["terms"] if name.startswith("worlds_")} == REHEARSED
+    assert not {"truth", "truth_sky"} & set(entry["terms"])
+
+
+REHEARSED = {f"worlds_{name}" for name in ("truth", "truth_shape", "truth_outlines", "truth_sky")}
+
+
 def test_a_run_of_two_processes_goes_on_with_one_to_the_same_weights(alone, shared):
     torch.set_num_threads(1)
     train(shared, epochs=3, samples_per_batch=2, processes=Processes())

@@ -15,6 +15,8 @@ from cvcdepth_core.training.pose_network import PoseAnswers, PoseScore, motion_e
 
 SPEC = DepthModelSpec(encoder="efficientnet_lite0", height=64, width=96, min_depth=0.5, max_depth=80)
 
+INTRINSICS = np.tile([[60.0, 0, 47.5], [0, 60.0, 31.5], [0, 0, 1]], (3, 1, 1))
+
 
 class Telling(torch.nn.Module):
     """Answers with one translation, and remembers what it saw."""
@@ -44,7 +46,7 @@ def test_it_sees_the_pictures_that_it_was_trained_with(method, views):
     network, frames = Telling((0.0, 0.0, -0.5)), pictures()
     mounts = np.tile(np.eye(4), (3, 1, 1))
     mounts[1, :3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]  # optical: z ahead is the vehicle's x
-    motion = PoseAnswers(network, method).later_T_earlier(frames[0], frames[1], mounts, 1)
+    motion = PoseAnswers(network, method).later_T_earlier(frames[0], frames[1], mounts, 1, INTRINSICS)
     ((earlier, later),) = network.seen
     assert earlier.shape == later.shape == (1, views, 3, 64, 96)
     shown = earlier[0, 0 if views == 1 else 1].permute(1, 2, 0) * 255
@@ -62,7 +64,7 @@ def test_the_answers_of_a_checkpoint_are_those_of_its_network(tmp_path):
     with torch.inference_mode():
         views = [torch.from_numpy(frame[:1]).permute(0, 3, 1, 2)[None].float() / 255 for frame in frames]
         _, translation = network(*views)
-    motion = answers.later_T_earlier(frames[0], frames[1], np.tile(np.eye(4), (3, 1, 1)), 0)
+    motion = answers.later_T_earlier(frames[0], frames[1], np.tile(np.eye(4), (3, 1, 1)), 0, INTRINSICS)
     np.testing.assert_allclose(motion[:3, 3], translation[0].numpy(), rtol=1e-5)
 
 

@@ -115,6 +115,46 @@ def test_with_contexts_truth_adds_to_the_other_terms_and_its_weight_of_zero_leav
     torch.testing.assert_close(without.per_sample, plain.per_sample)
 
 
+def test_sparse_truth_tells_neither_outlines_nor_sky():
+    torch.manual_seed(0)
+    whole = random_batch(2, 3, 32, 48)
+    truth = torch.where(torch.rand(2, 3, 1, 32, 48) < 0.1, depths(2, 3, 1, 32, 48), math.nan)
+    batch = with_truth(whole, truth, contexts=False)
+    batch.truth_is_sparse = True
+    prediction = random_prediction(whole)
+    depth = prediction.depth.detach().requires_grad_()
+    sky = torch.zeros_like(depth).requires_grad_()
+    prediction = Prediction(prediction.disparity, depth, prediction.motions[:, :0], sky)
+    value = evaluate_objective(batch, prediction, ObjectiveConfig())
+    assert set(value.terms) == {"truth", "truth_shape"}
+    value.loss.backward()
+    assert sky.grad is None
+    assert torch.equal(depth.grad != 0, torch.isfinite(truth))
+
+
+def test_what_is_taken_for_the_sky_can_be_left_out_of_what_pictures_teach():
+    torch.manual_seed(0)
+    batch = random_batch(2, 3, 32, 48)
+    noise = torch.zeros(2, 2, 3, 1, 32, 48, dtype=torch.float64)
+    sky = torch.full((2, 3, 1, 32, 48), -4.0, dtype=torch.float64)
+    sky[..., :12, :] = 4.0
+    shares = {}
+    for leave_out in (True, False):
+        found = random_prediction(batch)
+        disparity, depth = found.disparity.detach().requires_grad_(), found.depth.detach().requires_grad_()
+        prediction = Prediction(disparity, depth, found.motions, sky)
+        config = ObjectiveConfig(corrected=True, leave_out_sky=leave_out)
+        evaluate_objective(batch, prediction, config, noise).loss.backward()
+        sums = [(part.grad.abs()[..., rows, :].mean()) for part in (disparity, depth) for rows in (TOP, BOTTOM)]
+        shares[leave_out] = float(sums[0] / sums[1]), float(sums[2] / sums[3])
+    assert shares[True][0] == 0.0  # of the smoothness
+    assert shares[True][1] < 0.02  # what is left comes through the brightness that pictures are aligned by
+    assert min(shares[False]) > 0.3
+
+
+TOP, BOTTOM = slice(0, 10), slice(14, None)
+
+
 def test_a_batch_with_nothing_to_learn_from_or_impossible_truth_is_refused_by_name():
     whole = random_batch(2, 3, 32, 48)
     truth = depths(2, 3, 1, 32, 48)

@@ -183,7 +183,7 @@ def test_views_are_trained_on_and_what_the_lens_does_not_see_is_masked(drive: Pa
 def test_views_of_one_lens_have_no_baseline_and_are_trained_on_all_the_same(drive: Path, corrected: bool):
     index = build_index(drive, MatchingSettings())
     reader = SampleReader([index], [Sample(0, 1, 0, 2)], 64, 96, RecordingsConfig(cache_mb=0))
-    columns = [column for column in reader[0][1:] if column is not None]
+    columns = [column for column in reader[0][1:6] if column is not None]
     batch = reader.rigs[0].batch(*(torch.from_numpy(column[None]) for column in columns))
     disparity = torch.rand(1, 6, 1, 64, 96).requires_grad_()
     motions = torch.eye(4).expand(1, 2, 6, 4, 4).clone()

@@ -67,7 +67,7 @@ def recorded_motions(index: RecordingIndex, target: int, context: int) -> np.nda
 def test_motions_are_each_cameras_own_from_exposure_to_exposure(index):
     of = reader(index)
     sample = of.samples[3]
-    batch = of.rigs[0].batch(*(torch.from_numpy(part)[None] for part in of[3][1:]))
+    batch = of.rigs[0].batch(*(torch.from_numpy(part)[None] for part in of[3][1:6]))
     for place, context in enumerate((sample.before, sample.after)):
         expected = recorded_motions(index, sample.target, context)
         np.testing.assert_allclose(batch.recorded_motions[0, place].numpy(), expected, atol=1e-5)

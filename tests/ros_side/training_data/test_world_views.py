@@ -15,7 +15,15 @@ from cvcdepth_core.rig.rig import Camera
 from cvcdepth_core.training.config import TrainingConfig, WorldsConfig
 from cvcdepth_core.training.distributed import Processes
 from cvcdepth_core.worlds.shards import Shard, write_shard
-from cvcdepth_ros.training_data.world_views import ViewReader, WorldBatches, WorldView, find_shards, told_wrongly
+from cvcdepth_ros.training_data.world_views import (
+    ViewReader,
+    WorldBatches,
+    WorldRehearsal,
+    WorldView,
+    find_shards,
+    told_wrongly,
+    views_per_step,
+)
 
 pytest.importorskip("embreex", reason="worlds need embreex")
 
@@ -34,6 +42,7 @@ CONFIG = TrainingConfig.model_validate(
         "worlds": {"held_out": 0.0},
     }
 )
+ALONE = Processes()
 EXACT = WorldsConfig(angle_error=0.0, height_error=0.0)
 
 
@@ -126,6 +135,45 @@ def test_several_processes_share_the_views_of_each_batch(shards: Path):
 
 
 TWICE = {"optimizer": CONFIG.optimizer.model_copy(update={"samples_per_batch": 4})}
+
+
+def rehearsal(reader: ViewReader, share: float = 0.5, processes: Processes = ALONE) -> WorldRehearsal:
+    return WorldRehearsal(reader, with_share(share), 1.5, processes)
+
+
+def with_share(share: float) -> TrainingConfig:
+    worlds = CONFIG.worlds.model_copy(update={"share": share, "weight": 3.0})
+    return CONFIG.model_copy(update={"worlds": worlds})
+
+
+def frames_of(found: WorldRehearsal, step: int) -> torch.Tensor:
+    return torch.cat([one.batch.frames for one in found.of_step(step)])
+
+
+def test_beside_recordings_worlds_have_their_share_of_the_pictures(reader: ViewReader):
+    assert [views_per_step(with_share(share), cameras=6) for share in (0.0, 0.01, 0.2, 0.5, 0.8)] == [0, 1, 6, 24, 96]
+    found = rehearsal(reader)
+    assert (found.views_per_step, found.weight) == (6, 2.0)
+    assert [(one.first, len(one.batch.frames)) for one in found.of_step(1)] == [(0, 3), (3, 3)]
+
+
+def test_rehearsal_shows_every_view_before_one_comes_again_and_a_step_is_always_the_same(reader: ViewReader):
+    found, again = rehearsal(reader), rehearsal(reader)
+    items = [found._drawn(place)[0] for place in range(24)]
+    for turn in range(3):
+        assert sorted(items[8 * turn : 8 * turn + 8]) == list(range(8))
+    assert items[:8] != items[8:16]
+    frames_of(found, 1)
+    assert torch.equal(frames_of(found, 5), frames_of(again, 5))
+    assert not torch.equal(frames_of(found, 5), frames_of(again, 6))
+
+
+def test_several_processes_share_the_views_of_a_rehearsal(reader: ViewReader):
+    alone = frames_of(rehearsal(reader, 0.2), 3)  # 2 views
+    halves = [frames_of(rehearsal(reader, 0.2, Processes(rank, 2)), 3) for rank in (0, 1)]
+    assert torch.equal(alone, torch.cat(halves))
+    with pytest.raises(ConfigError, match=r"worlds.share is 0.2: that is 2 views in each step, fewer than the 3 proc"):
+        rehearsal(reader, 0.2, Processes(0, 3))
 
 
 def test_the_last_drives_are_held_out(shards: Path):
