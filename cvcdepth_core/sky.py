@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cvcdepth_core.surround_depth import SurroundPictures
 
-_FAR_SHARE = 0.9
+_FAR_SHARE = 0.5
 """Of the farthest depth that a network can say: beyond is sky, or as good as that."""
 
 _WIDTH = 160  # columns, about, of the picture that is searched

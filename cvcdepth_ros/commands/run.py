@@ -101,7 +101,7 @@ def execute(arguments: argparse.Namespace) -> None:
                 warn(ground.told)
         replay = SurroundReplay(recorded, settings, settings.min_cameras)
         with _trace(arguments.trace) as latencies:
-            depths = DepthReplay(replay, estimator, latencies, settings, settings.has_confidence)
+            depths = DepthReplay(replay, estimator, latencies, settings, settings.has_confidence, settings.cloud_deskew)
             outcome = _record(arguments, settings, replay, depths)
         result = {
             "version": package_version(),

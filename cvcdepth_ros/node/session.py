@@ -26,6 +26,7 @@ from cvcdepth_ros.messages.conversion import stamp_ns
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
 from cvcdepth_ros.node.diagnostics import (
     camera_status,
+    deskew_status,
     ground_plane_status,
     ground_problem,
     ground_status,
@@ -81,6 +82,7 @@ class SurroundSession:
         self._progress = SetProgress(self._synchroniser.required, parameters.tolerance, parameters.max_age)
         self._is_finished = False
         self._needs_confidence = parameters.needs_confidence
+        self._deskews = parameters.cloud_deskew
         with ExitStack() as opened:
             trace = None
             if parameters.trace:
@@ -96,7 +98,12 @@ class SurroundSession:
             motion = MotionInput(node, layout.base_frame, parameters.odometry_topic)
             self._motion = opened.enter_context(closing(motion))
             self._refinement = RefinementStage(
-                parameters, motion.poses.poses_at, self._wants_confidence, self.latencies, parameters.publish_odometry
+                parameters,
+                motion.poses.poses_at,
+                self._wants_confidence,
+                self.latencies,
+                parameters.publish_odometry,
+                wants_poses=parameters.cloud_deskew,
             )
             self._pipeline = SurroundPipeline(
                 estimator,
@@ -134,7 +141,7 @@ class SurroundSession:
     def poll(self) -> None:
         """Subscribe image topics that have appeared, and follow how far the sets come. To be called regularly."""
         self._inputs.connect()
-        if self._refinement.is_active:
+        if self._refinement.is_active or self._deskews:
             self._motion.connect()
         if self._transforms is not None:
             self._transforms.poll()
@@ -229,6 +236,7 @@ class SurroundSession:
             *([ground_status(self._assembler.layout)] if self._estimator.spec.is_told_its_rig else []),
             *([overlap_status(self._overlaps)] if self._overlaps else []),
             *([ground_plane_status(self._outputs.ground)] if self._outputs.ground else []),
+            *([deskew_status(self._outputs.deskewed)] if self._deskews else []),
             *([refinement_status(self._refinement, self._motion.poses)] if self._refinement.is_active else []),
         ]
 
