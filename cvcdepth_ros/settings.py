@@ -78,8 +78,9 @@ class ModelSettings(Settings):
     """In what a CUDA device computes; CPUs know float32 only."""
     cpu_fallback: bool = False
     """Go on with the CPU, more slowly, when the GPU fails, or its memory is too small even for one camera."""
-    refine: Literal["off", "geometry"] = "off"
-    """What is made of the network's depth: off leaves it, geometry compares pictures of neighbours and earlier ones."""
+    refine: Literal["auto", "geometry", "off"] = "off"
+    """What is made of the network's depth: off leaves it, geometry compares pictures of neighbours and earlier ones,
+    auto does so where odometry or /tf tells how the vehicle moves."""
     refine_width: int = Field(160, ge=32, le=4096)
     """Refinement and confidence only: columns of the grid that pictures are compared on, at most; more is slower."""
     flip_fusion: bool = False

@@ -61,9 +61,9 @@ class RunSettings(OutputSettings, MissingCameraSettings, MatchingSettings, Model
     """Store how sure depth is also where it is not refined; refined depth always has its confidence."""
 
     @property
-    def has_confidence(self) -> bool:
-        """Whether confidence is computed and stored."""
-        return self.confidence or self.needs_confidence or self.refine != "off"
+    def wants_confidence(self) -> bool:
+        """Whether confidence is computed and stored whatever becomes of depth."""
+        return self.confidence or self.needs_confidence
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -101,7 +101,9 @@ def execute(arguments: argparse.Namespace) -> None:
                 warn(ground.told)
         replay = SurroundReplay(recorded, settings, settings.min_cameras)
         with _trace(arguments.trace) as latencies:
-            depths = DepthReplay(replay, estimator, latencies, settings, settings.has_confidence, settings.cloud_deskew)
+            depths = DepthReplay(
+                replay, estimator, latencies, settings, settings.wants_confidence, settings.cloud_deskew
+            )
             outcome = _record(arguments, settings, replay, depths)
         result = {
             "version": package_version(),
@@ -156,7 +158,7 @@ def _record(
             settings,
             settings.clouds,
             window[0],
-            settings.has_confidence,
+            depths.refinement.is_active,
             settings.obstacles,
         ) as recorder,
     ):

@@ -91,11 +91,6 @@ class EvaluationSettings(SkySettings, MatchingSettings, ModelSettings):
         return self.model_copy(update={"refine": "off"}) if self.predictor else self
 
     @property
-    def has_confidence(self) -> bool:
-        """Whether confidence is computed and scored."""
-        return self.confidence or self.replayed.refine != "off"
-
-    @property
     def checkpoint_path(self) -> Path | None:
         """The checkpoint's file; None for a network with random weights and for a reference."""
         return None if self.predictor else super().checkpoint_path

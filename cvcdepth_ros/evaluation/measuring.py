@@ -204,7 +204,7 @@ class RecordingEvaluation:
             self.replay,
             predictor or job.settings.build_predictor(self.replay.rig),
             settings=job.settings.replayed,
-            wants_confidence=job.settings.has_confidence,
+            wants_confidence=job.settings.confidence,
         )
 
     @property

@@ -14,15 +14,18 @@ from pathlib import Path
 
 from cvcdepth_core.errors import CvcDepthError, RecordingError
 from cvcdepth_core.files import write_atomically
+from cvcdepth_core.networks.checkpoint import load_checkpoint
+from cvcdepth_core.refinement.odometry_check import STEPS_TO_JUDGE
 from cvcdepth_core.rig.rig_file import RigLayout
 from cvcdepth_core.training.config import MotionSource
 from cvcdepth_ros.bags import Location, file_identities, open_recording
 from cvcdepth_ros.checks import CheckContext, CheckOptions, CheckResult, NumberedResult, run_checks
 from cvcdepth_ros.installation import package_version
 from cvcdepth_ros.kept import Arrays, KeptResults, document_array, read_document
+from cvcdepth_ros.recordings.compared_pictures import JudgedOdometry, judge_odometry, parts_of
 from cvcdepth_ros.recordings.ground import RecordedGround, recorded_ground
 from cvcdepth_ros.recordings.rig import RecordedRig
-from cvcdepth_ros.settings import MatchingSettings
+from cvcdepth_ros.settings import MatchingSettings, ModelSettings
 from cvcdepth_ros.training_data.index import RecordingIndex, ScaleSource, load_index
 from cvcdepth_ros.training_data.own_body_masks import find_self_occlusion, save_masks
 
@@ -34,6 +37,8 @@ COUNTED_HERE: Collection[str] = ("training", "pose network")
 
 _CHECKS_FOLDER, _INDEX_FOLDER, _GROUND_FOLDER = "checks", "index", "ground"
 _MASKS_FOLDER, _FOUND_FILE = "masks", "found.json"
+_ODOMETRY_FOLDER, _WITHOUT_MOTION_FOLDER = "odometry", "without_motion"
+_JUDGED_PARTS, _JUDGED_SECONDS = 2, 2.5  # of a recording, whose motion is compared with the pictures
 
 
 @dataclass(frozen=True)
@@ -55,6 +60,8 @@ class Source:
     """`recordings.motion` of the configuration."""
     needs_ground: bool = False
     """Whether the network is told how high the ground lies."""
+    checkpoint: Path | None = None
+    """Weights by whose depth recorded motion is compared with the pictures; None: it is taken as it is."""
 
     @property
     def scale_from(self) -> ScaleSource:
@@ -84,13 +91,9 @@ def prepare(source: Source, run: Path) -> Prepared:
             checks = check_results(path, source, run)
             problems = [found for found in checks if found.result.status in ("failed", "warning")]
             _refuse(path, problems)
-            index = load_index(
-                path, run / _INDEX_FOLDER, source.matching, source.layout, source.base_frame, source.scale_from
-            )
-            if source.needs_ground:
-                index = _with_ground(index, source, run, prepared.warnings)
+            index, doubts = _index_of(path, source, run)
             prepared.indexes.append(index)
-            prepared.warnings += [_describe_finding(path, problem) for problem in problems]
+            prepared.warnings += [*(_describe_finding(path, problem) for problem in problems), *doubts]
             prepared.warnings += [f"{path}: {loss}" for loss in index.losses]
         except (CvcDepthError, OSError) as error:
             prepared.left_out[str(path)] = str(error)
@@ -101,10 +104,20 @@ def prepare(source: Source, run: Path) -> Prepared:
     return prepared
 
 
-def _with_ground(index: RecordingIndex, source: Source, run: Path, warnings: list[str]) -> RecordingIndex:
-    """Return the index with the ground's height in its rig; one that had to be found is told, and kept."""
-    if index.layout.ground_height is not None:
-        return index
+def _index_of(path: Location, source: Source, run: Path) -> tuple[RecordingIndex, list[str]]:
+    """Return the recording's index with the ground's height, where it is needed, and what is doubtful about it."""
+    index = load_index(path, run / _INDEX_FOLDER, source.matching, source.layout, source.base_frame, source.scale_from)
+    if not source.needs_ground or index.layout.ground_height is not None:
+        return _with_usable_motion(index, source, run)
+    ground = _ground_of(index, source, run)
+    if not ground.is_assumed:
+        index = replace(index, layout=index.layout.model_copy(update={"ground_height": ground.height}))
+    index, doubts = _with_usable_motion(index, source, run)
+    return index, [f"{path}: {ground.told}", *doubts]
+
+
+def _ground_of(index: RecordingIndex, source: Source, run: Path) -> RecordedGround:
+    """Look for the ground in the recording; what was found before in the very same one and rig is kept."""
 
     def find() -> RecordedGround:
         with open_recording(index.path) as recording:
@@ -117,11 +130,7 @@ def _with_ground(index: RecordingIndex, source: Source, run: Path, warnings: lis
         "rig": index.layout.model_dump(mode="json"),
     }
     kept = KeptResults(run / _GROUND_FOLDER, _ground_to_arrays, _ground_from_arrays)
-    ground = kept.load_or_make(str(index.path), work, find)
-    warnings.append(f"{index.path}: {ground.told}")
-    if ground.is_assumed:
-        return index
-    return replace(index, layout=index.layout.model_copy(update={"ground_height": ground.height}))
+    return kept.load_or_make(str(index.path), work, find)
 
 
 def _ground_to_arrays(ground: RecordedGround) -> Arrays:
@@ -152,6 +161,63 @@ def check_results(path: Location, source: Source, run: Path) -> list[NumberedRes
 
     kept = KeptResults(run / _CHECKS_FOLDER, _checks_to_arrays, _checks_from_arrays)
     return kept.load_or_make(str(path), work, run_all)
+
+
+def _with_usable_motion(index: RecordingIndex, source: Source, run: Path) -> tuple[RecordingIndex, list[str]]:
+    """Return the index, without its motion where that contradicts the pictures, and what is doubtful about it.
+
+    RecordingError where the configuration insists on such motion.
+    """
+    path = index.path
+    if source.motion == "network":
+        return index, []
+    if index.poses is None:
+        is_silent = source.motion == "recorded"  # the loader refuses
+        return index, [] if is_silent else [f"{path}: no motion is recorded, so the pose network's is taken"]
+    judged = _judged_odometry(index, source, run)
+    if judged.is_usable:
+        return index, [f"{path}: {judged.problem}"] if judged.problem else []
+    if source.motion == "recorded":
+        raise RecordingError(f"{path}: {judged.problem}; with recordings.motion: auto the pose network's is taken")
+    folder, options = run / _INDEX_FOLDER / _WITHOUT_MOTION_FOLDER, (source.matching, source.layout, source.base_frame)
+    without = load_index(path, folder, *options, "overlaps", with_motion=False)
+    doubt = f"{path}: {judged.problem}, so it is not used, and the pose network's motion is taken"
+    return replace(without, layout=index.layout, motion_problem=judged.problem), [doubt]
+
+
+def _judged_odometry(index: RecordingIndex, source: Source, run: Path) -> JudgedOdometry:
+    """Compare recorded motion with the pictures of two short parts, now or before in the very same recording."""
+    if source.checkpoint is None or len(index) <= STEPS_TO_JUDGE:
+        return JudgedOdometry("", is_usable=True)
+    weights = load_checkpoint(source.checkpoint)
+    work = {
+        "version": package_version(),
+        "files": file_identities(index.path),
+        "matching": source.matching.model_dump(),
+        "rig": index.layout.model_dump(mode="json"),
+        "checkpoint": weights.sha256,
+    }
+
+    def judge_now() -> JudgedOdometry:
+        with open_recording(index.path) as recording:
+            recorded = RecordedRig.from_recording(recording, index.layout).completed()
+            parts = parts_of(recording.start, recording.end + 1, _JUDGED_PARTS, _JUDGED_SECONDS)
+            network = ModelSettings.model_validate({"checkpoint": str(source.checkpoint)}).build_estimator()
+            try:
+                return judge_odometry(recorded, network, parts, source.matching)
+            except CvcDepthError as error:
+                return JudgedOdometry(f"motion cannot be compared with the pictures: {error}", is_usable=True)
+
+    kept = KeptResults(run / _ODOMETRY_FOLDER, _judged_to_arrays, _judged_from_arrays)
+    return kept.load_or_make(str(index.path), work, judge_now)
+
+
+def _judged_to_arrays(judged: JudgedOdometry) -> Arrays:
+    return {"judged": document_array(judged._asdict())}
+
+
+def _judged_from_arrays(arrays: Arrays) -> JudgedOdometry:
+    return JudgedOdometry(**read_document(arrays["judged"]))
 
 
 def _checks_to_arrays(checks: list[NumberedResult]) -> Arrays:

@@ -103,6 +103,7 @@ class SurroundSession:
                 self._wants_confidence,
                 self.latencies,
                 parameters.publish_odometry,
+                lambda: bool(motion.poses.topic),
                 wants_poses=parameters.cloud_deskew,
             )
             self._pipeline = SurroundPipeline(
@@ -141,7 +142,7 @@ class SurroundSession:
     def poll(self) -> None:
         """Subscribe image topics that have appeared, and follow how far the sets come. To be called regularly."""
         self._inputs.connect()
-        if self._refinement.is_active or self._deskews:
+        if self._refinement.needs_motion:
             self._motion.connect()
         if self._transforms is not None:
             self._transforms.poll()

@@ -19,6 +19,7 @@ from cvcdepth_ros.surround_sets.refinement import RefinementStage
 
 GEOMETRY = ModelSettings.model_validate({"refine": "geometry"})
 OFF = ModelSettings.model_validate({"refine": "off"})
+AUTO = ModelSettings.model_validate({"refine": "auto"})
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +43,19 @@ def test_switched_off_it_gives_what_it_is_given(drive):
     assert not stage.is_active
     assert [one.result for one in finished(stage, surround, sets)] == [one.result for one in sets]
     assert stage.summary() is None
+
+
+def test_auto_refines_from_when_on_something_tells_the_motion(drive):
+    surround, sets = drive
+    motion = [False, True, True]
+    stage = RefinementStage(AUTO, knows_motion=lambda: motion[0])
+    assert stage.needs_motion
+    for before in sets:
+        is_known = motion[0]
+        (after,) = finished(stage, surround, [before])
+        assert (after.result.depth is before.result.depth) is not is_known
+        motion.pop(0)
+        motion.append(True)
 
 
 def test_confidence_alone_leaves_depth_as_it_is(drive):
