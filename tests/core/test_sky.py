@@ -30,7 +30,7 @@ def street(sky=BLUE, horizon: int = 80):
 
 
 def test_depth_at_the_farthest_of_each_camera_is_sky():
-    depth = np.array([[[10.0, 199.0]], [[399.0, 250.0]], [[np.nan, 0.5]]], np.float32)
+    depth = np.array([[[10.0, 199.0]], [[399.0, 150.0]], [[np.nan, 0.5]]], np.float32)
     found = beyond_measure(depth, np.array([300.0, 600.0, 300.0]), max_depth=200.0, focal_scale=300.0)
     assert found.tolist() == [[[False, True]], [[True, False]], [[False, False]]]
 
