@@ -189,7 +189,7 @@ def thinned(points: Cloud, edge: float) -> Cloud:
 
     A hash table without chains: in every round each slot goes to one voxel, and those that did not get one try again.
     """
-    voxels = _voxels(points, edge)
+    voxels = cube_numbers(points, edge)
     table = np.empty(1 << _TABLE_BITS, dtype=np.int64)
     first = np.zeros(len(points), dtype=np.bool_)
     left = np.arange(len(points))
@@ -204,11 +204,13 @@ def thinned(points: Cloud, edge: float) -> Cloud:
     return points[first]
 
 
-def _voxels(points: Cloud, edge: float) -> NDArray[np.uint64]:
-    """Return the number [M] of the cube that each point lies in."""
+def cube_numbers(
+    points: Cloud, edge: float, origin: NDArray[np.int64] | tuple[int, int, int] = (0, 0, 0)
+) -> NDArray[np.uint64]:
+    """Return the number [M] of the cube of `edge` metres that each point lies in; `origin` counts cubes [3] too."""
     numbers = np.zeros(len(points), dtype=np.uint64)
     mask = np.uint64(2**_VOXEL_BITS - 1)
     for axis in range(3):
-        cells = np.floor(points[:, axis] * np.float32(1 / edge)).astype(np.int64).view(np.uint64)
+        cells = (np.floor(points[:, axis] * np.float32(1 / edge)).astype(np.int64) + origin[axis]).view(np.uint64)
         numbers = numbers << np.uint64(_VOXEL_BITS) | cells & mask
     return numbers

@@ -102,7 +102,7 @@ def execute(arguments: argparse.Namespace) -> None:
         replay = SurroundReplay(recorded, settings, settings.min_cameras)
         with _trace(arguments.trace) as latencies:
             depths = DepthReplay(
-                replay, estimator, latencies, settings, settings.wants_confidence, settings.cloud_deskew
+                replay, estimator, latencies, settings, settings.wants_confidence, settings.needs_poses
             )
             outcome = _record(arguments, settings, replay, depths)
         result = {

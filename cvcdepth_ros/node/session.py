@@ -104,7 +104,7 @@ class SurroundSession:
                 self.latencies,
                 parameters.publish_odometry,
                 lambda: bool(motion.poses.topic),
-                wants_poses=parameters.cloud_deskew,
+                wants_poses=parameters.needs_poses,
             )
             self._pipeline = SurroundPipeline(
                 estimator,

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cvcdepth_core.obstacles.ground import GroundPlane
+from cvcdepth_core.obstacles.persistence import Persistence
 from cvcdepth_core.obstacles.scan import Scan, ScanLimits, scan_of
 from cvcdepth_core.obstacles.separation import ObstacleLimits, SeparatedCloud, separate
 from cvcdepth_core.pointcloud import CameraMoments, Cloud, CloudLimits, banded, merged_cloud, organised_cloud, thinned
@@ -59,6 +60,8 @@ class OutputLimits(NamedTuple):
     scan: ScanLimits = ScanLimits()
     deskew: bool = False
     """Whether points are moved to the cloud's moment, where the vehicle's motion is known."""
+    persistence: int = 0
+    """How many earlier sets must have shown a point too."""
     has_times: bool = False
     """Whether points tell by how much later than the cloud's moment they were seen."""
 
@@ -70,6 +73,7 @@ class OutputLimits(NamedTuple):
             settings.obstacle_limits,
             settings.scan_limits,
             settings.cloud_deskew,
+            settings.cloud_persistence,
             settings.cloud_times,
         )
 
@@ -102,8 +106,9 @@ def camera_topics(camera: str) -> list[str]:
 class MergedProducts:
     """What is made of all cameras of a set together; each part is made once, when it is asked for."""
 
-    def __init__(self, estimated: EstimatedSet[Any], limits: OutputLimits) -> None:
-        self._estimated, self._limits = estimated, limits
+    def __init__(self, estimated: EstimatedSet[Any], limits: OutputLimits, persistence: Persistence) -> None:
+        """Make nothing yet; `persistence` remembers the sets before this one."""
+        self._estimated, self._limits, self._persistence = estimated, limits, persistence
 
     @cached_property
     def points(self) -> Cloud:
@@ -120,7 +125,12 @@ class MergedProducts:
     @cached_property
     def _whole(self) -> Cloud:
         estimated = self._estimated
-        return merged_cloud(estimated.result, estimated.rig, self._limits.cloud.whole, self._moments)
+        whole = merged_cloud(estimated.result, estimated.rig, self._limits.cloud.whole, self._moments)
+        if not self._limits.persistence:
+            return whole
+        poses, surround_set = estimated.world_T_base, estimated.surround_set
+        place = None if poses is None else poses[estimated.rig.names.index(surround_set.anchor)]
+        return self._persistence.filtered(whole, place, surround_set.time_ns, self._limits.persistence)
 
     @property
     def is_deskewed(self) -> bool:
@@ -155,6 +165,7 @@ class SurroundMessages:
         self._sky: SkyChoice = sky
         self._encoding = depth_encoding
         self._least = depth_min_confidence
+        self._persistence = Persistence()
         self.deskewed: bool | None = None
         """Whether the points of the last merged cloud were moved to its moment; None before any."""
         self.ground: GroundPlane | None = None
@@ -202,7 +213,7 @@ class SurroundMessages:
         stamp, rig = estimated.surround_set.stamp_ns, estimated.rig
         contained = [name for name, present in zip(rig.names, estimated.result.present, strict=True) if present]
         description = {"stamp": stamp, "frame_id": rig.base_frame, "cameras": contained}
-        make, frame, merged = self._factory, rig.base_frame, MergedProducts(estimated, limits)
+        make, frame, merged = self._factory, rig.base_frame, MergedProducts(estimated, limits, self._persistence)
         return {
             MERGED_CLOUD: lambda: make.point_cloud(stamp, frame, self._noted(merged).points),
             MERGED_CAMERAS: lambda: make.string(json.dumps(description)),

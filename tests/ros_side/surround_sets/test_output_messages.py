@@ -185,3 +185,19 @@ def test_the_field_t_tells_each_points_exposure(estimated):
         assert len(found[topic].data) == 20 * found[topic].width
         np.testing.assert_array_equal(np.unique(points(found[topic])[:, 4]), np.float32([0, 0.081]))
     assert len(found["left/points"].fields) == 4
+
+
+def test_points_that_the_set_before_did_not_show_are_left_out_where_that_is_asked_for(estimated):
+    builder, frames = SurroundMessages(bag_message_factory(), "32FC1"), dict.fromkeys(RIG.names, "optical")
+    places = np.stack([np.eye(4)] * 2)
+
+    def count(surround: Any, time: int) -> int:
+        surround_set = replace(estimated.surround_set, times_ns=dict.fromkeys(RIG.names, time))
+        one = replace(estimated, surround_set=surround_set, result=surround, world_T_base=places)
+        (found,) = builder.of_set(one, frames, OutputLimits(persistence=1), "points".__eq__)
+        return int(found.message.width)
+
+    street, empty = estimated.result, replace(seen(post=False).surround, sky=estimated.result.sky)
+    assert count(empty, STAMP) == np.count_nonzero(~empty.sky)
+    assert count(street, STAMP + 10**8) < np.count_nonzero(~street.sky) - 100  # the post is new
+    assert count(street, STAMP + 2 * 10**8) == np.count_nonzero(~street.sky)
