@@ -63,6 +63,12 @@ def test_in_doubt_there_is_no_sky(picture, why):
     assert not sky_in_picture(picture, upward(), FAR).any(), why
 
 
+def test_pixels_without_depth_do_not_hide_the_sky_around_them():
+    partly = FAR.copy()
+    partly[:30, :100] = np.nan
+    assert sky_in_picture(street(), upward(), partly)[:76].all()
+
+
 def test_a_light_wall_that_the_network_sees_near_is_no_sky():
     near = np.where(np.arange(HEIGHT)[:, None] < 100, np.float32(6.0), FAR)
     assert not sky_in_picture(street(), upward(), near).any()
