@@ -29,7 +29,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo bench test lint test-ros test-core test-faults fuzz soak messages lock clean
+.PHONY: help demo bench ablation test lint test-ros test-core test-faults fuzz soak messages lock clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z0-9_-]*\):.* ## /\1\t/p' Makefile | expand -t 12
@@ -44,6 +44,9 @@ bench: $(DEV) ## run every benchmark, an hour on a quiet machine; its table into
 		echo "$$name ..." && .venv/bin/python benchmarks/$$name.py $(if $(AGAINST),$(against)) \
 		  > output/bench/$$name.jsonl || exit 1; done
 	.venv/bin/python benchmarks/table.py $(BENCHMARKS:%=output/bench/%.jsonl)
+
+ablation: $(DEV) ## the paper's ablation on simulated drives, for hours: into OUT=FOLDER, from FROM=CHECKPOINT; goes on where it was
+	.venv/bin/python tools/ablation_worlds.py -o $(or $(OUT),output/ablation) $(if $(FROM),--from $(FROM))
 
 # The soak mostly waits, and asserts nothing about time.
 test: lint test-ros ## everything that CI runs: lint, all tests, and three minutes of soak beside the slow ones

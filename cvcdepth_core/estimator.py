@@ -20,6 +20,7 @@ from cvcdepth_core.networks.registry import DepthModelSpec
 from cvcdepth_core.networks.volume import refuse_cameras_outside
 from cvcdepth_core.rig.ground import refuse_unlikely_ground
 from cvcdepth_core.rig.rig import Rig
+from cvcdepth_core.sky import beyond_measure, sky_in_pictures
 from cvcdepth_core.surround_depth import SurroundDepth, SurroundPictures
 
 
@@ -140,6 +141,12 @@ class DepthEstimator:
                 found = found.fused(self._predicted(mirrored), self.flip_fusion)
         return found.arrays()
 
+    def sky(self, surround: SurroundPictures, depth: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Return where a set shows the sky [N, H, W], by its `depth` where the network knows the sky, else by looks."""
+        if self.spec.tells_sky:
+            return beyond_measure(depth, surround.fx, self.spec.max_depth, self.spec.focal_scale)
+        return sky_in_pictures(surround, depth)
+
     def _predicted(self, surround: SurroundPictures) -> "_Predicted":
         outputs = self._engine.details(surround)
         depth = disparity_to_depth(
@@ -175,6 +182,11 @@ class _Predicted(NamedTuple):
         return PredictedDepth(self.depth[:, 0].numpy(), sky, log_uncertainty)
 
 
+def is_told_its_rig(predictor: DepthPredictor) -> bool:
+    """Say whether its depth depends on where the rig's cameras are and look, and how high above the ground."""
+    return isinstance(predictor, DepthEstimator) and predictor.spec.is_told_its_rig
+
+
 def untrained_network(spec: DepthModelSpec, seed: int = 0) -> DepthNetwork:
     """Return a depth network whose weights are random and always the same."""
     with torch.random.fork_rng(devices=[]):
@@ -194,7 +206,7 @@ class SurroundDepthEstimator:
         RigError names the camera where the network is told the rig, and the rig cannot be right about the ground, or
         where the network's volume does not contain it.
         """
-        if isinstance(estimator, DepthEstimator) and estimator.spec.is_told_its_rig:
+        if is_told_its_rig(estimator):
             refuse_unlikely_ground(rig)
         if isinstance(estimator, DepthEstimator) and estimator.spec.volume is not None:
             refuse_cameras_outside(estimator.spec.volume, rig.poses_above_ground, rig.names)
@@ -219,7 +231,8 @@ class SurroundDepthEstimator:
         if pictures.present.any():
             known = pictures.valid & pictures.present[:, None, None]
             np.copyto(depth, self.estimator.estimate(pictures), where=known)
-        return SurroundDepth(depth, pictures.pictures, pictures.intrinsics, pictures.present)
+        sky = self.estimator.sky(pictures, depth) if isinstance(self.estimator, DepthEstimator) else None
+        return SurroundDepth(depth, pictures.pictures, pictures.intrinsics, pictures.present, sky=sky)
 
     def _surround_pictures(self, rectified: Sequence[Picture | None]) -> SurroundPictures:
         pictures = np.zeros((*self.preprocessor.valid.shape, 3), dtype=np.uint8)

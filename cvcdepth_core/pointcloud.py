@@ -3,7 +3,7 @@
 
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -36,12 +36,23 @@ class CloudLimits:
     """Edge in metres of the cubes of which each keeps one point; 0 keeps every point."""
     min_confidence: float = 0.0
     """Pixels of less confidence make no points."""
+    min_height: float = -float("inf")
+    """z in the base frame, metres; lower points are left out."""
+    max_height: float = float("inf")
+    """z in the base frame, metres; higher points are left out."""
+    edge_clearance: float = 0.0
+    """Metres: pixels on a surface that would pass nearer than this by the camera are edges, and make no points."""
+
+    @property
+    def whole(self) -> "CloudLimits":
+        """The same for points of any height, and all of them."""
+        return replace(self, voxel=0.0, min_height=-np.inf, max_height=np.inf)
 
 
 def organised_cloud(surround: SurroundDepth, camera: int, min_confidence: float = 0.0) -> Cloud:
     """Return one camera's cloud [H, W, 4] in its optical frame.
 
-    x, y, z are NaN where depth is (REP 118), or confidence is below `min_confidence`.
+    x, y, z are NaN where depth is (REP 118), in the sky, and where confidence is below `min_confidence`.
     """
     depth = surround.sure_depth(camera, min_confidence)
     cloud = np.empty((*depth.shape, 4), dtype=np.float32)
@@ -52,7 +63,7 @@ def organised_cloud(surround: SurroundDepth, camera: int, min_confidence: float 
 
 
 def merged_cloud(surround: SurroundDepth, rig: Rig, limits: CloudLimits) -> Cloud:
-    """Return the points of all cameras with known depth inside `limits`, [M, 4] in the base frame."""
+    """Return the points of all cameras with known depth inside `limits`, [M, 4] in the base frame; none of the sky."""
     merged = np.empty((surround.depth[:, :: limits.stride, :: limits.stride].size, 4), dtype=np.float32)
     end = 0
     for camera in np.flatnonzero(surround.present).tolist():
@@ -60,9 +71,20 @@ def merged_cloud(surround: SurroundDepth, rig: Rig, limits: CloudLimits) -> Clou
         rays = base_T_camera[:3, :3] @ np.linalg.inv(surround.intrinsics[camera])
         depth, picture = surround.sure_depth(camera, limits.min_confidence), surround.pictures[camera]
         view = _View(depth, picture, rays, base_T_camera[:3, 3], limits.stride)
+        if limits.edge_clearance > 0:
+            focal = float(surround.intrinsics[camera, 0, 0]) / limits.stride
+            edges = on_edges(view.depth, focal, limits.edge_clearance)
+            view.depth = np.where(edges, np.float32(np.nan), view.depth)
         for rows in view.blocks():
             end += _append(view, rows, limits, merged[end:])
-    return thinned(merged[:end], limits.voxel) if limits.voxel else merged[:end]
+    inside = banded(merged[:end], limits)
+    return thinned(inside, limits.voxel) if limits.voxel else inside
+
+
+def banded(points: Cloud, limits: CloudLimits) -> Cloud:
+    """Return the points [M, 4] of the base frame whose height is inside `limits`: all of them, where they all are."""
+    inside = (points[:, 2] >= limits.min_height) & (points[:, 2] <= limits.max_height)
+    return points if inside.all() else points[inside]
 
 
 def _append(view: "_View", rows: slice, limits: CloudLimits, free: Cloud) -> int:
@@ -75,6 +97,22 @@ def _append(view: "_View", rows: slice, limits: CloudLimits, free: Cloud) -> int
     if count < depth.size:
         points[:count] = points.view(_POINT)[inside].view(np.float32)
     return count
+
+
+def on_edges(depth: NDArray[np.float32], focal: float, clearance: float) -> NDArray[np.bool_]:
+    """Return which pixels [H, W] lie on a step of depth, where no surface is, but what joins two of them.
+
+    Along a plane that passes `clearance` metres from the camera, inverse depth changes by 1 / (focal clearance) per
+    pixel at most, however far away: what changes faster would pass nearer. `focal` is in pixels. NaN is no step.
+    """
+    nearness = 1 / depth
+    steepest = np.float32(1 / (focal * clearance))
+    edges = np.zeros(depth.shape, dtype=np.bool_)
+    across = np.abs(nearness[:, 1:] - nearness[:, :-1]) > steepest
+    down = np.abs(nearness[1:] - nearness[:-1]) > steepest
+    for part, steps in ((np.s_[:, 1:], across), (np.s_[:, :-1], across), (np.s_[1:], down), (np.s_[:-1], down)):
+        edges[part] |= steps
+    return edges
 
 
 class _View:

@@ -4,9 +4,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+SkyChoice = Literal["far", "nan", "keep"]
+"""What depth images say of the sky: beyond measure (inf), nothing (NaN), or what the network said."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,10 +50,37 @@ class SurroundDepth:
     """[N, H, W] probability that depth is right within a factor of 1.25, 0 where nothing could be checked; None where
     it was not asked for."""
 
+    sky: NDArray[np.bool_] | None = None
+    """[N, H, W] where there is nothing to measure; `depth` there means nothing. None where nobody looked for it."""
+
     def sure_depth(self, camera: int, least: float) -> NDArray[np.float32]:
-        """Return a camera's depth [H, W], NaN where its confidence is below `least`; all of it where that is 0."""
-        depth: NDArray[np.float32] = self.depth[camera]
+        """Return a camera's depth [H, W], NaN in the sky and where its confidence is below `least`."""
+        return self._without(self.depth[camera], self._unsure(camera, least), self._sky(camera))
+
+    def shown_depth(self, camera: int, sky: SkyChoice, least: float = 0.0) -> NDArray[np.float32]:
+        """Return a camera's depth [H, W] as images show it (REP 118): NaN where its confidence is below `least`.
+
+        In the sky, whatever the confidence, it is what `sky` says.
+        """
+        shown = self._without(self.depth[camera], self._unsure(camera, least))
+        there = self._sky(camera)
+        if there is None or sky == "keep":
+            return shown
+        return np.where(there & ~np.isnan(self.depth[camera]), np.float32(np.inf if sky == "far" else np.nan), shown)
+
+    def _unsure(self, camera: int, least: float) -> NDArray[np.bool_] | None:
         if least <= 0:
-            return depth
-        sure = np.False_ if self.confidence is None else self.confidence[camera] >= least
-        return np.where(sure, depth, np.float32(np.nan)).astype(np.float32)
+            return None
+        if self.confidence is None:
+            return np.ones(self.depth.shape[1:], dtype=np.bool_)
+        return np.asarray(self.confidence[camera] < least)
+
+    def _sky(self, camera: int) -> NDArray[np.bool_] | None:
+        return None if self.sky is None else self.sky[camera]
+
+    @staticmethod
+    def _without(depth: NDArray[np.float32], *masks: NDArray[np.bool_] | None) -> NDArray[np.float32]:
+        for mask in masks:
+            if mask is not None:
+                depth = np.where(mask, np.float32(np.nan), depth)
+        return depth

@@ -7,7 +7,7 @@ The node declares these fields as parameters, the bag tool as options; each fiel
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from cvcdepth_core.errors import ConfigError, first_validation_message
 from cvcdepth_core.model_choices import DEFAULT, NOTICE, Backend, FlipFusion, Precision, checkpoint_path
@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from cvcdepth_core.estimator import DepthEstimator
     from cvcdepth_core.networks import DepthNetwork
     from cvcdepth_core.networks.registry import DepthModelSpec
+    from cvcdepth_core.obstacles.scan import ScanLimits
+    from cvcdepth_core.obstacles.separation import ObstacleLimits
     from cvcdepth_core.pointcloud import CloudLimits
 
 
@@ -32,6 +34,13 @@ CHANGEABLE_WHILE_RUNNING = (
     "cloud_max_range",
     "cloud_voxel",
     "cloud_min_confidence",
+    "cloud_min_height",
+    "cloud_max_height",
+    "cloud_edge_clearance",
+    "obstacle_min_height",
+    "obstacle_max_height",
+    "obstacle_max_range",
+    "scan_resolution",
 )
 """Parameters of the node that need not wait until it is cleaned up."""
 
@@ -69,8 +78,9 @@ class ModelSettings(Settings):
     """In what a CUDA device computes; CPUs know float32 only."""
     cpu_fallback: bool = False
     """Go on with the CPU, more slowly, when the GPU fails, or its memory is too small even for one camera."""
-    refine: Literal["off", "geometry"] = "off"
-    """What is made of the network's depth: off leaves it, geometry compares pictures of neighbours and earlier ones."""
+    refine: Literal["auto", "geometry", "off"] = "off"
+    """What is made of the network's depth: off leaves it, geometry compares pictures of neighbours and earlier ones,
+    auto does so where odometry or /tf tells how the vehicle moves."""
     refine_width: int = Field(160, ge=32, le=4096)
     """Refinement and confidence only: columns of the grid that pictures are compared on, at most; more is slower."""
     flip_fusion: bool = False
@@ -151,7 +161,14 @@ class MissingCameraSettings(Settings):
     """Cameras without which no set is made: with fewer than all, dead cameras are left out; 0 holds such sets back."""
 
 
-class OutputSettings(Settings):
+class SkySettings(Settings):
+    """What becomes of the sky."""
+
+    sky: Literal["far", "nan", "keep"] = "far"
+    """Depth of the sky: far (inf, as REP 118 has it), nan, or keep (what the network says). Clouds have none of it."""
+
+
+class OutputSettings(SkySettings):
     """Encoding of the depth images and limits of the merged cloud."""
 
     depth_encoding: Literal["32FC1", "16UC1"] = "32FC1"
@@ -169,6 +186,22 @@ class OutputSettings(Settings):
     depth_min_confidence: float = Field(0.0, ge=0, le=1)
     """Depth images: confidence below which depth is left unknown; 0 takes all."""
 
+    cloud_min_height: float = Field(-1000.0, ge=-1e4, le=1e4)
+    """Merged cloud: z in the base frame, metres, below which points are left out."""
+    cloud_max_height: float = Field(1000.0, ge=-1e4, le=1e4)
+    """Merged cloud: z in the base frame, metres, above which points are left out."""
+    cloud_edge_clearance: float = Field(0.0, ge=0, le=10)
+    """Merged cloud and obstacles: leave out edges of depth, that is surfaces that would pass nearer than so many metres
+    by their camera; 0 keeps them."""
+    obstacle_min_height: float = Field(0.3, ge=0, le=100)
+    """Obstacles: metres above the ground that was found from which points are obstacles, and no ground."""
+    obstacle_max_height: float = Field(2.0, gt=0, le=100)
+    """Obstacles: metres above the ground that the vehicle fits below."""
+    obstacle_max_range: float = Field(40.0, gt=0, le=1e4)
+    """Obstacles, ground and scan: metres from the base frame."""
+    scan_resolution: float = Field(0.5, ge=0.05, le=30)
+    """Scan: degrees between two beams."""
+
     @field_validator("cloud_voxel")
     @classmethod
     def _check_voxel(cls, metres: float) -> float:
@@ -182,8 +215,37 @@ class OutputSettings(Settings):
         from cvcdepth_core.pointcloud import CloudLimits
 
         return CloudLimits(
-            self.cloud_stride, self.cloud_min_range, self.cloud_max_range, self.cloud_voxel, self.cloud_min_confidence
+            self.cloud_stride,
+            self.cloud_min_range,
+            self.cloud_max_range,
+            self.cloud_voxel,
+            self.cloud_min_confidence,
+            self.cloud_min_height,
+            self.cloud_max_height,
+            self.cloud_edge_clearance,
         )
+
+    @property
+    def obstacle_limits(self) -> "ObstacleLimits":
+        """What is an obstacle."""
+        from cvcdepth_core.obstacles.separation import ObstacleLimits
+
+        return ObstacleLimits(self.obstacle_min_height, self.obstacle_max_height, self.obstacle_max_range)
+
+    @property
+    def scan_limits(self) -> "ScanLimits":
+        """What the scan is like."""
+        from cvcdepth_core.obstacles.scan import ScanLimits
+
+        return ScanLimits(self.scan_resolution)
+
+    @model_validator(mode="after")
+    def _check_heights(self) -> "OutputSettings":
+        for kind in ("cloud", "obstacle"):
+            least, most = getattr(self, f"{kind}_min_height"), getattr(self, f"{kind}_max_height")
+            if least >= most:
+                raise ValueError(f"{kind}_min_height {least:g} must be below {kind}_max_height {most:g}")
+        return self
 
     @property
     def needs_confidence(self) -> bool:

@@ -63,7 +63,7 @@ def main() -> None:
     runs = list(planned_runs(options))
     index = load_index(options.recording, options.output / "index", MatchingSettings.model_validate({}), layout)
     for run in runs:
-        train(run, index, None if run.variant in options.encoder else options.start)
+        train(run, [index], None if run.variant in options.encoder else options.start)
         print(f"{run.variant}, seed {run.seed}: trained", flush=True)
     scores = {run: evaluate(run, index, options) for run in runs}
     options.table.write_text(table(runs, scores), encoding="utf-8")
@@ -91,10 +91,10 @@ def planned_run(variant: str, seed: int, config: TrainingConfig, output: Path) -
     return Run(variant, seed, config, output / f"{name}-{seed}")
 
 
-def train(run: Run, index: RecordingIndex, start: Path | None) -> None:
+def train(run: Run, indexes: Sequence[RecordingIndex], start: Path | None) -> None:
     """Train to the configured end; nothing happens where that is reached."""
     model = build_surround_model(run.config, load_checkpoint(start) if start else None)
-    Trainer(run.config, model, RecordingBatches([index], run.config), run.folder).train(quiet=True)
+    Trainer(run.config, model, RecordingBatches(indexes, run.config), run.folder).train(quiet=True)
 
 
 def evaluate(run: Run, index: RecordingIndex, options: argparse.Namespace) -> dict[str, Any]:

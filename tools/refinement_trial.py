@@ -45,10 +45,10 @@ from cvcdepth_core.refinement.mounts import MountSearch, RefinedMounts
 from cvcdepth_core.refinement.refiner import RefinedDepth, SurroundRefiner
 from cvcdepth_core.refinement.settings import RefinementSettings
 from cvcdepth_core.rendering.projection import axis_angle_to_rotation
-from cvcdepth_core.rig.pinhole import scale_intrinsics
 from cvcdepth_core.rig.poses import Pose, inverse
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.rig.rig_file import load_rig_layout
+from cvcdepth_core.rig.view import PicturePart
 from cvcdepth_core.scoring.confidence import CalibrationTable, ConfidenceSamples, confidence_samples, sparsification
 from cvcdepth_core.scoring.sparse_depth import SparseDepth
 from cvcdepth_core.surround_depth import SurroundPictures
@@ -73,6 +73,10 @@ class TrialSet:
     fine: SurroundMoment
     """The same with pictures of twice the size and the same depth, enlarged."""
     truth: Sequence[SparseDepth]
+    parts: Sequence[PicturePart]
+    """What of each camera's true picture the depth shows."""
+    truth_intrinsics: Sequence[NDArray[np.float64]]
+    """[3, 3] of each camera's true picture."""
     network_twist: Twist | None
     """The pose network's answer; None for the first set."""
 
@@ -149,7 +153,8 @@ def read(path: str, rig: Path | None) -> Recorded:
             moment = taken(one, usual, one.estimated.result.pictures)
             larger = taken(one, fine, fine_pictures(one, fine))
             twist = network_twist(pose_network, sets[-1].moment, moment, anchor) if sets else None
-            sets.append(TrialSet(moment, larger, one.truth, twist))
+            views = [camera.rectified_view.intrinsics for camera in built.cameras]
+            sets.append(TrialSet(moment, larger, one.truth, one.parts, views, twist))
         estimator = evaluation.depths.estimator
         first = sets[0].moment
         surround = SurroundPictures(first.pictures, first.present, first.intrinsics, first.base_T_camera, first.valid)
@@ -305,11 +310,8 @@ def world_points(one: TrialSet) -> list[NDArray[np.float64]]:
     """Return each camera's true points [M, 3] in the world."""
     moment = one.moment
     found = []
-    for camera, truth in enumerate(one.truth):
-        height, width = moment.depth.shape[1:]
-        K = scale_intrinsics(moment.intrinsics[camera], (truth.width / width, truth.height / height))
+    for truth, K, pose in zip(one.truth, one.truth_intrinsics, moment.camera_poses, strict=True):
         pixels = np.stack([truth.columns, truth.rows, np.ones(len(truth))], axis=1) @ np.linalg.inv(K).T
-        pose = moment.camera_poses[camera]
         found.append(pixels * truth.depth[:, None] @ pose[:3, :3].T + pose[:3, 3])
     return found
 
@@ -356,9 +358,11 @@ def scored(recorded: Recorded, still: Standing, result: Result, of_prior: bool) 
         depth = one.sized(refined.depth.shape[2]).depth if of_prior else refined.depth
         confidence = refined.prior_confidence if of_prior else refined.confidence
         for camera, truth in enumerate(one.truth):
-            samples = confidence_samples(depth[camera], confidence[camera], truth, MIN_DEPTH, MAX_DEPTH)
-            standing = confidence_samples(depth[camera], confidence[camera], truth[still[number][camera]], MIN_DEPTH)
-            moving = confidence_samples(depth[camera], confidence[camera], truth[~still[number][camera]], MIN_DEPTH)
+            stands = still[number][camera]
+            samples, standing, moving = (
+                confidence_samples(depth[camera], confidence[camera], found, MIN_DEPTH, MAX_DEPTH, one.parts[camera])
+                for found in (truth, truth[stands], truth[~stands])
+            )
             rows.append(image_row(camera, samples, standing, moving))
             table = table + CalibrationTable.from_samples(samples)
     cameras = np.stack([nanmean([row[1:] for row in rows if row[0] == c]) for c in range(len(recorded.rig.cameras))])
@@ -484,7 +488,8 @@ def print_confidence_maps(recorded: Recorded, mounts: RefinedMounts) -> None:
             for camera, truth in enumerate(recorded.sets[number].truth):
                 pairs = ((refined.depth, refined.confidence), (prior[number], refined.prior_confidence))
                 for samples, (depth, raw) in zip(found.values(), pairs, strict=True):
-                    samples.append(confidence_samples(depth[camera], raw[camera], truth, MIN_DEPTH, MAX_DEPTH))
+                    part = recorded.sets[number].parts[camera]
+                    samples.append(confidence_samples(depth[camera], raw[camera], truth, MIN_DEPTH, MAX_DEPTH, part))
     for name, samples in found.items():
         raw = np.concatenate([s.confidence for s in samples])
         right = np.concatenate([np.abs(np.log(s.prediction / s.truth)) < RIGHT_WITHIN for s in samples])

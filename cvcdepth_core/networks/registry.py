@@ -64,6 +64,11 @@ class DepthModelSpec(BaseModel):
         """Whether the network is told where its cameras are above the ground; rigs that have that wrong are refused."""
         return self.network == RIG_CONDITIONED
 
+    @property
+    def tells_sky(self) -> bool:
+        """Whether the network knows the sky: then its depth there is the farthest that it can say."""
+        return self.network == RIG_CONDITIONED
+
     @field_validator("network")
     @classmethod
     def _network_is_known(cls, network: str) -> str:

@@ -40,6 +40,7 @@ _HUBER, _CUT = 6.0, 40.0  # grey levels
 _IN_FRONT = 0.1
 _LEAST_AGREEMENT = 0.5
 _CONVERGED = 1e-4  # metres and radians
+_SMALL_TURN = 1e-4  # radians below which powers take the place of sine and cosine
 _PATCH = [(row, column) for row in (-1, 0, 1) for column in (-1, 0, 1)]
 
 
@@ -107,7 +108,7 @@ def align(previous: AlignedSet, current: AlignedSet, starts: Sequence[Twist] = (
 
 def exponential(motion: Twist) -> Pose:
     """Return the pose [4, 4] that a constant motion [6] (m, rad) reaches: exp of the twist."""
-    return np.asarray(_exponentials(torch.from_numpy(motion)[None])[0].numpy())
+    return np.asarray(_exponentials(motion[None])[0])
 
 
 def logarithm(pose: Pose) -> Twist:
@@ -116,7 +117,7 @@ def logarithm(pose: Pose) -> Twist:
     sine = np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]])
     angle = math.atan2(float(np.linalg.norm(sine)) / 2, (float(np.trace(rotation)) - 1) / 2)
     turn = sine / 2 * (1.0 if angle < 1e-9 else angle / math.sin(angle))
-    skew = _skew(torch.from_numpy(turn)).numpy()
+    skew = _skew(turn)
     beyond = 1 / 12 if angle < 1e-4 else (1 - angle / 2 / math.tan(angle / 2)) / angle**2
     return np.concatenate([(np.eye(3) - skew / 2 + beyond * skew @ skew) @ pose[:3, 3], turn])
 
@@ -203,7 +204,7 @@ def _gradients(grey: Tensor) -> tuple[Tensor, Tensor]:
 
 def _residuals(pair: _Pair, twist: Twist) -> _Residuals:
     """Compare the patches with the pictures before, after the motion."""
-    motions = _exponentials(torch.from_numpy(twist) * pair.seconds[:, None]).float()
+    motions = torch.from_numpy(_exponentials(twist * pair.seconds.numpy()[:, None])).float()
     moved = transform(motions, pair.points)
     x, y, z = transform(pair.camera_T_base, moved).unbind(1)
     nearness = z.clamp(min=_IN_FRONT).reciprocal()
@@ -292,17 +293,24 @@ def _problem(cameras: int, least: int, agreement: float) -> str | None:
     return None
 
 
-def _exponentials(motions: Tensor) -> Tensor:
-    """Return the poses [M, 4, 4] of motions [M, 6] (m, rad), float64."""
-    matrix = motions.new_zeros(len(motions), 4, 4)
-    matrix[:, :3, :3] = _skew(motions[:, 3:])
-    matrix[:, :3, 3] = motions[:, :3]
-    found: Tensor = torch.linalg.matrix_exp(matrix)
-    return found
+def _exponentials(motions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the poses [M, 4, 4] of motions [M, 6] (m, rad), in closed form (Rodrigues)."""
+    squares = np.square(motions[:, 3:]).sum(1)[:, None, None]
+    is_small = squares < _SMALL_TURN**2
+    turn = np.sqrt(np.where(is_small, 1.0, squares))
+    first = np.where(is_small, 1 - squares / 6, np.sin(turn) / turn)
+    second = np.where(is_small, 1 / 2 - squares / 24, (1 - np.cos(turn)) / turn**2)
+    third = np.where(is_small, 1 / 6 - squares / 120, (1 - first) / turn**2)
+    skew, poses = _skew(motions[:, 3:]), np.tile(np.eye(4), (len(motions), 1, 1))
+    square = skew @ skew
+    poses[:, :3, :3] += first * skew + second * square
+    poses[:, :3, 3:] = (np.eye(3) + second * skew + third * square) @ motions[:, :3, None]
+    return poses
 
 
-def _skew(vectors: Tensor) -> Tensor:
+def _skew(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the matrices [..., 3, 3] of the cross products with `vectors` [..., 3]."""
-    x, y, z = vectors.unbind(-1)
-    zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).view(*x.shape, 3, 3)
+    found = np.zeros((*vectors.shape, 3))
+    for axis, (row, column) in enumerate(((2, 1), (0, 2), (1, 0))):
+        found[..., row, column], found[..., column, row] = vectors[..., axis], -vectors[..., axis]
+    return found

@@ -97,6 +97,11 @@ class DriveRefiner:
         """Whether enough sets were compared with odometry to know whether it fits."""
         return self._check.is_ready
 
+    @property
+    def contradicts_odometry(self) -> bool:
+        """Whether the pictures contradict odometry in more than its scale."""
+        return self._check.is_contradicted()
+
     def refine(self, moment: SurroundMoment) -> RefinedSet:
         """Refine the next set; its `world_T_base` is the recorded motion, None where that is not known now."""
         if self._last is not None and moment.time_ns < self._last.time_ns - _SPREAD_NS:

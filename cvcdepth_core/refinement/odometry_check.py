@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from cvcdepth_core.refinement.alignment import Twist, logarithm
 from cvcdepth_core.rig.poses import Pose, inverse
 
+STEPS_TO_JUDGE = 10
+"""Steps that must have been compared before anything is said."""
+
 _KEPT = 50
-_LEAST = 10
 _SLOW, _MOVING = 0.1, 0.5  # metres per second
 _FASTEST_CHANGE = 20.0  # metres per second from one step to the next: more is a jump
 _SCALE = 1.2  # depth's own scale is hardly better
@@ -55,7 +57,7 @@ class OdometryCheck:
     @property
     def is_ready(self) -> bool:
         """Whether enough is known to judge."""
-        return len(self._steps) >= _LEAST
+        return len(self._steps) >= STEPS_TO_JUDGE
 
     def is_usable(self) -> bool:
         """Whether the odometry may be used.
@@ -69,6 +71,14 @@ class OdometryCheck:
         moving = np.linalg.norm(seen[:, :3], axis=1) > _MOVING
         others = _worse_than_scale(times, seen, recorded, moving)
         return others is None and 1 / _USABLE_SCALE <= _scale(seen[moving], recorded[moving]) <= _USABLE_SCALE
+
+    def is_contradicted(self) -> bool:
+        """Whether the pictures contradict the odometry in more than its scale, which depth may have wrong."""
+        if not self.is_ready:
+            return False
+        times, seen, recorded = (np.array(column) for column in zip(*self._steps, strict=True))
+        moving = np.linalg.norm(seen[:, :3], axis=1) > _MOVING
+        return _worse_than_scale(times, seen, recorded, moving) is not None
 
     def problem(self) -> str | None:
         """Say what is wrong with the odometry, in one line; None while nothing is, or too little is known."""
@@ -99,14 +109,14 @@ def _jump(times: NDArray[np.float64], recorded: NDArray[np.float64]) -> str | No
 
 
 def _standing(seen: NDArray[np.float64], recorded: NDArray[np.float64]) -> str | None:
-    if len(seen) < _LEAST or np.median(np.linalg.norm(recorded[:, :3], axis=1)) > _SLOW:
+    if len(seen) < STEPS_TO_JUDGE or np.median(np.linalg.norm(recorded[:, :3], axis=1)) > _SLOW:
         return None
     speed = np.median(np.linalg.norm(seen[:, :3], axis=1))
     return f"odometry stands still while the pictures move at {speed:.1f} m/s"
 
 
 def _other_frame(seen: NDArray[np.float64], recorded: NDArray[np.float64]) -> str | None:
-    if len(seen) < _LEAST:
+    if len(seen) < STEPS_TO_JUDGE:
         return None
     ways = [_mean_direction(twists[:, :3]) for twists in (seen, recorded)]
     if min(np.linalg.norm(way) for way in ways) < _STEADY:
@@ -135,7 +145,7 @@ def _lag(times: NDArray[np.float64], seen: NDArray[np.float64], recorded: NDArra
     """Compare speed and turn rate after every shift; what tells are changes, so scale and level are left out."""
     shifts = np.arange(-_LONGEST_LAG, _LONGEST_LAG + _LAG_STEP / 2, _LAG_STEP)
     inner = (times >= times[0] + _LONGEST_LAG) & (times <= times[-1] - _LONGEST_LAG)
-    if inner.sum() < _LEAST:
+    if inner.sum() < STEPS_TO_JUDGE:
         return None
     misfits = np.zeros(len(shifts))
     for mine, theirs, least in zip(_courses(seen), _courses(recorded), _LEAST_VARIATIONS, strict=True):
@@ -166,7 +176,7 @@ def _scale(seen: NDArray[np.float64], recorded: NDArray[np.float64]) -> float:
 
 
 def _wrong_scale(seen: NDArray[np.float64], recorded: NDArray[np.float64]) -> str | None:
-    if len(seen) < _LEAST:
+    if len(seen) < STEPS_TO_JUDGE:
         return None
     ratio = _scale(seen, recorded)
     if 1 / _SCALE <= ratio <= _SCALE:

@@ -77,7 +77,7 @@ class VisualOdometry:
         if last is None or not 0 < float(now.times.mean()) - last.reference_time <= _LONGEST_GAP:
             self._now = _Now.anew(now)
             return None
-        motion = align(now, last.aligned, [*guesses, *([] if last.twist is None else [last.twist])])
+        motion = align(now, last.aligned, _distinct([*guesses, *([] if last.twist is None else [last.twist])]))
         seconds = float(now.times.mean()) - last.reference_time
         self._now = _Now.anew(now, motion) if motion.problem else _moved(last, now, motion, seconds)
         return motion
@@ -107,6 +107,11 @@ class VisualOdometry:
         aligned = now._replace(depth=reduced_depth(torch.from_numpy(depth), depth.shape[2] // now.depth.shape[2]))
         twist = motion.twist if motion is not None and motion.problem is None else None
         self._last = _Last(aligned, float(now.times.mean()), here, covariance, twist)
+
+
+def _distinct(twists: Sequence[Twist]) -> list[Twist]:
+    """Leave out what is there already."""
+    return [one for n, one in enumerate(twists) if not any(np.array_equal(one, other) for other in twists[:n])]
 
 
 def _moved(last: _Last, now: AlignedSet, motion: AlignedMotion, seconds: float) -> _Now:

@@ -16,6 +16,20 @@ LEAST_HEIGHT, GREATEST_HEIGHT = 0.2, 6.0
 """Metres of a camera above the ground between which networks are trained, with room on both sides."""
 
 
+def is_on_ground(base_frame: str) -> bool:
+    """Say whether a frame lies on the ground by its name, as REP 105 has it."""
+    return base_frame.rpartition("/")[2] == "base_footprint"
+
+
+def unstated_ground(base_frame: str, why_not_found: str = "") -> str:
+    """Return one line that tells that nobody says where the ground is, with the remedy."""
+    reason = f" and was not found ({why_not_found})" if why_not_found else ""
+    return (
+        f"the height of the ground in {base_frame} is not stated{reason}: taken for 0 m, and depth is as wrong as that "
+        "is; `cvcdepth rig BAG` looks for it in a recording, or state it in the rig file: ground_height: -0.4"
+    )
+
+
 def refuse_unlikely_ground(rig: Rig) -> None:
     """Raise RigError, with camera, values and remedy, where a rig cannot be right about the ground.
 
@@ -24,10 +38,11 @@ def refuse_unlikely_ground(rig: Rig) -> None:
     for camera, pose in zip(rig.cameras, rig.poses_above_ground, strict=True):
         height = float(pose[2, 3])
         if not LEAST_HEIGHT <= height <= GREATEST_HEIGHT:
+            found = "not stated, so taken for 0" if rig.ground_height is None else f"found {rig.ground_height:g}"
             raise RigError(
                 f"camera {camera.name}: {height:.2f} m above the ground, which this network is told, expected "
                 f"{LEAST_HEIGHT:g} to {GREATEST_HEIGHT:g}; write into the rig file how high the ground lies in "
-                f"{rig.base_frame}, as ground_height: -0.4 (found {rig.ground_height:g})"
+                f"{rig.base_frame}, as ground_height: -0.4 ({found})"
             )
         if pose[2, 1] > 0:
             raise RigError(

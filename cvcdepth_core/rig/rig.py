@@ -67,14 +67,19 @@ class Rig:
     base_frame: str
     anchor: str
     given_neighbours: Mapping[str, tuple[str, ...]]
-    ground_height: float = 0.0
-    """Metres of the ground in the base frame: negative where the base frame lies above it."""
+    ground_height: float | None = None
+    """Metres of the ground in the base frame: negative where the base frame lies above it; None where nobody says."""
+
+    @property
+    def ground_z(self) -> float:
+        """`ground_height`; where nobody says it, 0, as for the `base_footprint` of REP 105."""
+        return 0.0 if self.ground_height is None else self.ground_height
 
     @property
     def poses_above_ground(self) -> NDArray[np.float64]:
         """Each camera's pose [N, 4, 4] in the frame below the base frame, turned alike, whose z = 0 is the ground."""
         poses = np.stack([camera.base_T_camera for camera in self.cameras])
-        poses[:, 2, 3] -= self.ground_height
+        poses[:, 2, 3] -= self.ground_z
         return poses
 
     @property

@@ -106,9 +106,10 @@ class RigLayout(BaseModel):
     aspect: Aspect = "crop"
     """How pictures come into a network of another shape, by more than 10 %: rows that are too many are cut off (crop),
     borders are left empty (pad), or pixels become wider or narrower than high (stretch)."""
-    ground_height: float = Field(default=0.0, ge=-20, le=20, allow_inf_nan=False)
+    ground_height: float | None = Field(default=None, ge=-20, le=20, allow_inf_nan=False)
     """Metres of the ground in the base frame, below the vehicle as it stands; 0 where the base frame lies on the ground
-    (REP 105's base_footprint), negative where it is higher. Networks that are told their rig need it."""
+    (REP 105's base_footprint), negative where it is higher. Networks that are told their rig need it; where it is not
+    stated, it is looked for in recordings, and else taken for 0."""
     cameras: tuple[CameraEntry, ...]
     """The cameras, in the order in which every array of a set holds them."""
 
@@ -138,6 +139,11 @@ class RigLayout(BaseModel):
     def names(self) -> list[str]:
         """The cameras' names, in order."""
         return [camera.name for camera in self.cameras]
+
+    @property
+    def ground_z(self) -> float:
+        """`ground_height`, 0 where it is not stated."""
+        return 0.0 if self.ground_height is None else self.ground_height
 
     @property
     def anchor_camera(self) -> str:

@@ -16,6 +16,7 @@ from cvcdepth_core.worlds.building import build_world
 from cvcdepth_core.worlds.description import Part, WorldSpec
 from cvcdepth_core.worlds.odometry import Told, told_motion
 from cvcdepth_core.worlds.rendering.camera_response import daylight_of, develop
+from cvcdepth_core.worlds.rendering.flow import flow
 from cvcdepth_core.worlds.rendering.lenses import Lens
 from cvcdepth_core.worlds.rendering.lidar import Sweep, sweep
 from cvcdepth_core.worlds.rendering.renderer import Renderer, Truth
@@ -86,6 +87,19 @@ class SimulatedDrive:
         view = self.renderer.view(self.lenses[camera], mount.base_T_camera, time, sensors.readout)
         seed = (camera, number, _CAMERA, sensors.seed)
         return Shot(develop(view.light, sensors.look(camera), self._daylight, seed), view.truth)
+
+    def flow(self, camera: int, number: int, truth: Truth) -> NDArray[np.float32]:
+        """Return by how many pixels [H, W, 2] (x, y) everything in a shot's `truth` moves until the camera's next set.
+
+        NaN for the sky and for what is behind the camera then. With a rolling shutter, as if all rows were the middle
+        one.
+        """
+        lens, mount = self.lenses[camera], self.rig.cameras[camera]
+        times = (self.spec.camera_time(mount, each) for each in (number, number + 1))
+        seen, later = ((lens, mount.base_T_camera, time) for time in times)
+        places = flow(self.world, self.way, truth, seen, later)
+        rows, columns = np.mgrid[: lens.height, : lens.width]
+        return np.asarray(places - np.stack([columns, rows], axis=-1), np.float32)
 
     def sweep(self, number: int) -> Sweep | None:
         """Turn the LiDAR once; None where there is none."""

@@ -34,7 +34,7 @@ from cvcdepth_ros.node.diagnostics import inference_status, synchronisation_stat
 from cvcdepth_ros.node.parameters import declare_parameters, read_parameters
 from cvcdepth_ros.node.subscriptions import CameraInputs
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
-from cvcdepth_ros.surround_sets.output_messages import MERGED_CLOUD, SurroundMessages, output_types
+from cvcdepth_ros.surround_sets.output_messages import MERGED_CLOUD, OutputLimits, SurroundMessages, output_types
 from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet, estimate_set
 from cvcdepth_ros.surround_sets.synchronizer import SurroundSet, SurroundSynchronizer
 
@@ -78,10 +78,10 @@ class BaselineNode(Node):  # type: ignore[misc] # rclpy is not annotated
                 self._counters["published"] += 1
 
     def _handle(self, surround_set: SurroundSet[Any]) -> None:
-        images, rig, limits = surround_set.images, self._surround.rig, self._settings.cloud_limits
+        images, rig, limits = surround_set.images, self._surround.rig, OutputLimits.of(self._settings)
         result = estimate_set(images, self._surround, self._latencies, len(images))
         with self._latencies.measure("postprocess"):
-            cloud = baseline_cloud(result, rig, limits)
+            cloud = baseline_cloud(result, rig, limits.cloud)
             merged = self._factory.point_cloud(surround_set.stamp_ns, rig.base_frame, cloud)
         with self._latencies.measure("publish"):
             self._outputs[MERGED_CLOUD].publish(merged)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from cvcdepth_ros.checks.context import CheckContext, CheckOptions, CheckResult, Status
 from cvcdepth_ros.checks.depth_checks import check_mounts, check_odometry
+from cvcdepth_ros.checks.ground_checks import check_ground
 from cvcdepth_ros.checks.picture_checks import check_brightness, check_places
 from cvcdepth_ros.checks.rig_checks import (
     check_camera_infos,
@@ -40,6 +41,7 @@ CHECKS: Mapping[str, Callable[[CheckContext], CheckResult]] = {
     "lenses": check_lenses,
     "mounts": check_mounts,
     "odometry": check_odometry,
+    "ground": check_ground,
 }
 
 

@@ -48,7 +48,7 @@ def check_odometry(context: CheckContext) -> CheckResult:
     if not compared.has_odometry:
         return CheckResult("skipped", "neither /tf nor odometry is recorded")
     if compared.odometry_problem:
-        remedy = "correct scale, frame or stamps of the odometry; refinement does without, where it is far off"
+        remedy = "correct scale, frame or stamps of odometry; where it is far off, refinement and training do without"
         return CheckResult("warning", compared.odometry_problem, remedy)
     if not compared.has_judged_odometry:
         return CheckResult("skipped", f"too few sets in a row to tell: {compared.sets}")

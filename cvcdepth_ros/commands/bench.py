@@ -124,13 +124,14 @@ def _engine_text(result: dict[str, Any]) -> str:
 def _measure_nodes(arguments: argparse.Namespace) -> None:
     from cvcdepth_ros.bags import open_recording
     from cvcdepth_ros.end_to_end.repeated_recording import write_repeated
+    from cvcdepth_ros.recordings.ground import with_ground
     from cvcdepth_ros.recordings.rig import RecordedRig
 
     model = settings_from(arguments, ModelSettings)
     require_ros("bench")
     with tempfile.TemporaryDirectory(prefix="cvcdepth_bench_") as folder, open_recording(arguments.recording) as source:
         given = rig_layout(arguments)
-        recorded = RecordedRig.from_recording(source, given, arguments.base_frame)
+        recorded, _ = with_ground(RecordedRig.from_recording(source, given, arguments.base_frame))
         layout = recorded.layout if given is None else recorded.completed().layout
         played = Path(folder) / "played"
         write_repeated(source, layout, played, arguments.seconds)

@@ -34,10 +34,10 @@ if TYPE_CHECKING:
 
 SUMMARY = """Check whether recordings and a rig will work, with a remedy for what will not.
 
-Seventeen numbered checks: cameras, calibrations, transforms, stamps, sets, overlaps, masks, LiDAR, motion, encodings,
+Eighteen numbered checks: cameras, calibrations, transforms, stamps, sets, overlaps, masks, LiDAR, motion, encodings,
 brightness, whether two cameras were swapped, what `finetune` would learn from, a checkpoint's pose network, how much of
-its lens each camera shows, and with --pictures whether neighbours' pictures fit the mounts, and odometry the pictures.
-The exit code is 1 when a check failed; warnings leave it at 0."""
+its lens each camera shows, how high the ground lies, and with --pictures whether neighbours' pictures fit the mounts,
+and odometry the pictures. The exit code is 1 when a check failed; warnings leave it at 0."""
 EXAMPLES: tuple[str, ...] = (
     "check drive.mcap",
     "check drives/ --rig rig.yaml --tolerance 0.05 --lidar /lidar/points --json",

@@ -207,6 +207,9 @@ def _warn_of_losses(job: EvaluationJob, scores: "RecordingScores") -> None:
         warn(f"{job.path}: not everything could be read: {damage}; evaluated {sets} sets of the {seconds:.1f} s there")
     for note in scores.summary.get("notes", ()):
         warn(f"{job.path}: {note}")
+    ground = scores.summary["ground"]
+    if ground["source"] == "assumed" and ground["told_to_network"]:
+        warn(f"{job.path}: {ground['told']}")
     left_out = scores.summary.get("why_no_lidar")
     if left_out:
         warn(f"{job.path}: {left_out}")

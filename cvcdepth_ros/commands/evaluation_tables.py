@@ -15,12 +15,14 @@ from cvcdepth_ros.evaluation.references import BEST_CONSTANT, reference_titles
 
 if TYPE_CHECKING:
     from cvcdepth_core.scoring.confidence_scores import ConfidenceScores
+    from cvcdepth_core.scoring.obstacles import ObstacleScores
     from cvcdepth_core.scoring.scores import Score
     from cvcdepth_ros.evaluation.measuring import RecordingScores
     from cvcdepth_ros.evaluation.result import EvaluationResult
 
 _SCORE_COLUMNS = ("abs_rel", "scaled", "scale", "rmse", "delta_1", "coverage", "truth")
 _LABEL_FREE_COLUMNS = ("between cameras", "along the way", "photo between", "photo along")
+_OBSTACLE_COLUMNS = ("recall", "precision", "squares", "predicted", "driven places", "said taken")
 _CONFIDENCE_COLUMNS = ("abs_rel", "surest half", "ause", "aurg")
 _NAME_WIDTH = 20
 
@@ -31,6 +33,10 @@ _SCALED = (
 _CONFIDENCE = (
     "surest half: abs_rel of the half of the pixels with the largest confidence. ause: area above an oracle that "
     "removes the worst pixels first, 0 is perfect; aurg: area won over removal at random; both over abs_rel."
+)
+_OBSTACLES = (
+    "Obstacles: squares of 0.5 m that are taken between 0.3 and 2 m above the ground, within so many metres of the "
+    "vehicle. driven places: where the vehicle came to later, which must have been free."
 )
 _LABEL_FREE = (
     "No truth, so these are label-free scores, lower is better: by how much a point's depth differs between "
@@ -47,11 +53,14 @@ def evaluation_text(result: EvaluationResult, folder: Path) -> str:
         blocks.append(_recordings_table(result, has_truth))
     if result.confidence is not None and has_truth:
         blocks.append(_confidence_table(result.confidence))
+    if result.obstacles is not None and (result.obstacles.counts.any() or result.obstacles.driven.any()):
+        blocks.append(_obstacle_table(result.obstacles))
     return "\n\n".join(filter(None, [*blocks, "\n".join(_lines(result, folder))]))
 
 
 def _lines(result: EvaluationResult, folder: Path) -> Iterator[str]:
     yield from (f"not evaluated: {failure.reason}" for failure in result.failed)
+    yield from dict.fromkeys(found.summary["ground"]["told"] for found in result.recordings)
     reasons = {found.summary["no_flat_ground"]: None for found in result.recordings if found.summary["no_flat_ground"]}
     yield from (f"no flat ground to compare with: {reason}; see --ground-height" for reason in reasons)
     for seen in result.trained_on:
@@ -86,6 +95,26 @@ def _confidence_table(confidence: ConfidenceScores) -> str:
     rows = [(shortened(name, _NAME_WIDTH), *map(_number, numbers)) for name, numbers in found.items()]
     off = f"Calibration: confidence is off by {_number(confidence.calibration.expected_error)} on average."
     return f"{_numbers('confidence', _CONFIDENCE_COLUMNS, rows)}\n\n{paragraph(f'{_CONFIDENCE} {off}')}"
+
+
+def _obstacle_table(obstacles: ObstacleScores) -> str:
+    found = obstacles.to_json()
+    rows = []
+    for metres, within in found["within"].items():
+        shares = [_number(math.nan if within[name] is None else within[name]) for name in ("recall", "precision")]
+        taken = within["driven_places_taken"]
+        numbers = (str(within["truth"]), str(within["predicted"]), str(within["driven_places"]))
+        rows.append((f"within {metres} m", *shares, *numbers, "-" if taken is None else f"{taken:.1%}"))
+    blocks = [_numbers("obstacles", _OBSTACLE_COLUMNS, rows), "", paragraph(_OBSTACLES)]
+    nearest = found["nearest"]
+    if nearest["median_error"] is not None:
+        blocks.append(
+            paragraph(
+                f"Nearest obstacle within 20 m, by directions of 5 degrees: off by {nearest['median_error']:.2f} m "
+                f"(median of {nearest['both']}), {nearest['missed']} missed, {nearest['invented']} invented."
+            )
+        )
+    return "\n".join(blocks)
 
 
 def _label_free_table(result: EvaluationResult) -> str:

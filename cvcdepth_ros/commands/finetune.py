@@ -142,6 +142,7 @@ def _fine_tuned(job: "FinetuneJob", processes: "Processes") -> "FinetuneResult |
 
 
 def _job(arguments: argparse.Namespace, config: "TrainingConfig", start: "Checkpoint | None") -> "FinetuneJob":
+    from cvcdepth_core.model_choices import checkpoint_path
     from cvcdepth_ros.bags import find_recordings
     from cvcdepth_ros.finetuning.preparation import Source
     from cvcdepth_ros.finetuning.run import FinetuneJob
@@ -157,6 +158,8 @@ def _job(arguments: argparse.Namespace, config: "TrainingConfig", start: "Checkp
         lidar_topics(arguments),
         arguments.base_frame,
         config.recordings.motion,
+        config.depth.is_told_its_rig,
+        checkpoint_path(arguments.start or ""),
     )
     with_promotion = not arguments.no_promotion
     shards = find_shards(arguments.worlds)

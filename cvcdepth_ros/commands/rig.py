@@ -19,6 +19,7 @@ from cvcdepth_ros.process_setup import prepare_long_work
 if TYPE_CHECKING:
     from cvcdepth_core.rig.rig import Camera, Rig
     from cvcdepth_core.rig.rig_file import CameraEntry, RigLayout
+    from cvcdepth_ros.recordings.ground import RecordedGround
     from cvcdepth_ros.recordings.rig import RecordedRig
 
 _NARROWEST_DEG = 5.0
@@ -30,6 +31,7 @@ counter-clockwise around the vehicle from the front one, and computes which of t
 finds where a camera sees the vehicle itself, which stands still in the picture while the scene moves, and writes a PNG
 for it beside the rig file. With --rig, a file that names the cameras only (config/rigs/) is completed. With --refine,
 cameras are turned a little so that neighbours' pictures agree where they overlap; it refuses where they do not tell.
+How high the ground lies in the base frame is measured where a LiDAR sees it.
 
 With --view the cameras show so much of their lenses, whatever P of camera_info says. A lens of more than 120 degrees is
 shown by two or three virtual cameras, NAME_l, NAME_m and NAME_r."""
@@ -65,7 +67,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--ground-height",
         type=float,
         metavar="M",
-        help="how high the ground lies in the base frame, metres: below 0 where that is above it [0]",
+        help="how high the ground lies in the base frame, metres: below 0 where that is above it [as the recording "
+        "shows]",
     )
     parser.add_argument("--masks", action="store_true", help="find the vehicle's own body (reads the whole recording)")
     parser.add_argument(
@@ -92,7 +95,8 @@ def execute(arguments: argparse.Namespace) -> None:
         recorded = recorded if given is None else recorded.completed()
         if arguments.view:
             recorded = recorded.with_layout(_with_views(recorded.layout, arguments.view)).completed()
-        layout = _with_ground(recorded.layout, arguments.ground_height)
+        ground = _ground(recorded, arguments.ground_height)
+        layout = _with_ground(recorded.layout, ground)
         layout = layout.model_copy(
             update={
                 "anchor": _anchor(layout, arguments.anchor),
@@ -110,9 +114,9 @@ def execute(arguments: argparse.Namespace) -> None:
         mounts: dict[str, Any] = {}
         if arguments.refine:
             layout, mounts = _with_refined_mounts(recorded.with_layout(layout), arguments.checkpoint)
-    result = {**_describe(layout, layout.complete(), shares), **mounts}
+    result = {**_describe(layout, layout.complete(), shares), "ground": ground.to_json(), **mounts}
     source = f"cvcdepth rig {package_version()}, from the recording {path.name}"
-    save_rig_layout(arguments.output, layout, f"Written by {source}.\n{_overlaps_text(result)}")
+    save_rig_layout(arguments.output, layout, f"Written by {source}.\n{_overlaps_text(result)}\n{ground.told}.")
     result = {"file": str(arguments.output), "recording": arguments.recording, **result}
     print_result(result, _text(result), arguments.json)
 
@@ -184,13 +188,25 @@ def _with_refined_mounts(recorded: "RecordedRig", checkpoint: str) -> tuple["Rig
     return turned_layout(recorded.layout, compared.mounts), {"refined": told}
 
 
-def _with_ground(layout: "RigLayout", height: float | None) -> "RigLayout":
+def _ground(recorded: "RecordedRig", height: float | None) -> "RecordedGround":
+    """Return the ground that is asked for, else the rig file's, else the one that the recording shows."""
+    from cvcdepth_ros.recordings.ground import RecordedGround, recorded_ground
+
+    if height is not None:
+        return RecordedGround(height, "stated", recorded.layout.base_frame)
+    ground = recorded_ground(recorded)
+    if ground.is_assumed:
+        warn(f"{recorded.recording.path}: {ground.told}")
+    return ground
+
+
+def _with_ground(layout: "RigLayout", ground: "RecordedGround") -> "RigLayout":
     from cvcdepth_core.rig.rig_file import RigLayout
 
-    if height is None:
+    if ground.is_assumed:
         return layout
     try:
-        return RigLayout.model_validate(layout.model_dump() | {"ground_height": height})
+        return RigLayout.model_validate(layout.model_dump() | {"ground_height": ground.height})
     except ValidationError as error:
         raise ConfigError(f"--ground-height: {first_validation_message(error)}") from error
 
@@ -277,8 +293,8 @@ def _text(result: dict[str, Any]) -> str:
     header = ("camera", "yaw (deg)", "view (deg)", "height (m)", "size", "distortion", "mask", "images")
     return (
         f"{table(header, cameras, apart=len(header) - 1)}\n\n{_overlaps_text(result)}\n\n{refined}"
-        f"base frame {result['base_frame']}, the ground at {result['ground_height']:g} m in it (--ground-height; some "
-        f"networks need it), anchor camera {result['anchor']}; written to {result['file']}"
+        f"{result['ground']['told']}\n"
+        f"base frame {result['base_frame']}, anchor camera {result['anchor']}; written to {result['file']}"
     )
 
 

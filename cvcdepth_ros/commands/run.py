@@ -55,13 +55,15 @@ class RunSettings(OutputSettings, MissingCameraSettings, MatchingSettings, Model
 
     clouds: Literal["merged", "all", "none"] = "merged"
     """Clouds to store: the merged one, each camera's organised one too, or none."""
+    obstacles: bool = False
+    """Store the points of obstacles and of the ground, and the scan of the nearest obstacles, too."""
     confidence: bool = False
     """Store how sure depth is also where it is not refined; refined depth always has its confidence."""
 
     @property
-    def has_confidence(self) -> bool:
-        """Whether confidence is computed and stored."""
-        return self.confidence or self.needs_confidence or self.refine != "off"
+    def wants_confidence(self) -> bool:
+        """Whether confidence is computed and stored whatever becomes of depth."""
+        return self.confidence or self.needs_confidence
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -88,11 +90,18 @@ def execute(arguments: argparse.Namespace) -> None:
     if settings.notice:
         warn(settings.notice)
     with open_recording(arguments.recording) as recording:
+        from cvcdepth_ros.recordings.ground import with_ground
         from cvcdepth_ros.recordings.replay import DepthReplay, SurroundReplay  # torch: not before there is a recording
 
-        replay = SurroundReplay(_recorded_rig(arguments, recording), settings, settings.min_cameras)
+        estimator, recorded = settings.build_estimator(), _recorded_rig(arguments, recording)
+        ground = None
+        if estimator.spec.is_told_its_rig:
+            recorded, ground = with_ground(recorded)
+            if ground.is_assumed:
+                warn(ground.told)
+        replay = SurroundReplay(recorded, settings, settings.min_cameras)
         with _trace(arguments.trace) as latencies:
-            depths = DepthReplay(replay, settings.build_estimator(), latencies, settings, settings.has_confidence)
+            depths = DepthReplay(replay, estimator, latencies, settings, settings.wants_confidence)
             outcome = _record(arguments, settings, replay, depths)
         result = {
             "version": package_version(),
@@ -100,6 +109,7 @@ def execute(arguments: argparse.Namespace) -> None:
             "output": str(arguments.output),
             "model": depths.estimator.model_id,
             "configuration": _configuration(arguments, settings, replay),
+            "ground": None if ground is None else ground.to_json(),
             **outcome,
             "damage": recording.damage,
             "notes": replay.notes,
@@ -141,7 +151,13 @@ def _record(
     with (
         _stoppable() as stop,
         DepthRecorder(
-            arguments.output, replay, settings, settings.clouds, window[0], settings.has_confidence
+            arguments.output,
+            replay,
+            settings,
+            settings.clouds,
+            window[0],
+            depths.refinement.is_active,
+            settings.obstacles,
         ) as recorder,
     ):
         sets = depths.sets(*window, recorder.handlers)
@@ -237,6 +253,7 @@ def _text(result: dict[str, Any]) -> str:
             *(f"note: {note}" for note in result["notes"]),
             f"{sets['written']} sets written of {sets['matched']} matched; {sets['incomplete']} incomplete, "
             f"{sets['refused']} refused",
+            *([result["ground"]["told"]] if result["ground"] else []),
             *_refinement_text(result["refinement"]),
             f"{seconds['total']:.1f} s: {stages}",
             f"{result['output']}, by {result['model']}",

@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--truth",
         choices=("none", "depth", "all"),
         default="depth",
-        help="depth, or objects and what moves too [depth]",
+        help="depth; or all: objects, what moves, normals and flow too [depth]",
     )
     parser.add_argument(
         "--look", choices=("clean", "varied"), default="varied", help="ideal cameras or real ones [varied]"

@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 
 from cvcdepth_core.model_choices import FlipFusion
 from cvcdepth_ros.installation import package_version
-from cvcdepth_ros.settings import LIDAR_TOLERANCE, MatchingSettings, ModelSettings
+from cvcdepth_ros.settings import LIDAR_TOLERANCE, MatchingSettings, ModelSettings, SkySettings
 
 if TYPE_CHECKING:
     from cvcdepth_core.estimator import DepthPredictor
@@ -32,15 +32,16 @@ class Dependencies(NamedTuple):
     """Hash of the checkpoint's bytes; None without one."""
 
 
-class EvaluationSettings(MatchingSettings, ModelSettings):
+class EvaluationSettings(SkySettings, MatchingSettings, ModelSettings):
     """Everything that decides the scores of a given recording, beside the rig and the part that is taken."""
 
     predictor: Literal["constant", "ground_plane"] | None = None
     """Score a reference that looks at no picture instead of a network: what any network must beat."""
     constant_depth: float = Field(10.0, gt=0, le=1e4)
     """Predictor constant only: metres."""
-    ground_height: float = Field(0.0, ge=-100, le=100)
-    """Predictor ground_plane only: the ground's z in the base frame, metres (-0.4 where that is at a car's axles)."""
+    ground_height: float | None = Field(None, ge=-100, le=100)
+    """The ground's z in the base frame, metres (-0.4 where that is at a car's axles), for flat ground and for networks
+    that are told their rig; without it the rig file's, else what LiDAR or pictures show, else 0."""
     min_depth: float = Field(0.0, ge=0, le=1e4)
     """Metres; truth at or below it is left out, predictions are clamped to it."""
     max_depth: float = Field(80.0, gt=0, le=1e4)
@@ -90,11 +91,6 @@ class EvaluationSettings(MatchingSettings, ModelSettings):
         return self.model_copy(update={"refine": "off"}) if self.predictor else self
 
     @property
-    def has_confidence(self) -> bool:
-        """Whether confidence is computed and scored."""
-        return self.confidence or self.replayed.refine != "off"
-
-    @property
     def checkpoint_path(self) -> Path | None:
         """The checkpoint's file; None for a network with random weights and for a reference."""
         return None if self.predictor else super().checkpoint_path
@@ -118,7 +114,7 @@ class EvaluationSettings(MatchingSettings, ModelSettings):
         if self.predictor == "constant":
             return constant_depth(rig, self.constant_depth, self.height, self.width)
         if self.predictor == "ground_plane":
-            return ground_plane_depth(rig, self.ground_height, self.max_depth, self.height, self.width)
+            return ground_plane_depth(rig, rig.ground_z, self.max_depth, self.height, self.width)
         return self.build_estimator()
 
 

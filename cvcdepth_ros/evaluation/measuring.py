@@ -16,23 +16,27 @@ import torch
 from numpy.typing import NDArray
 
 from cvcdepth_core.errors import RecordingError
-from cvcdepth_core.estimator import DepthPredictor
+from cvcdepth_core.estimator import DepthPredictor, is_told_its_rig
 from cvcdepth_core.rendering.agreement import PosedDepth
 from cvcdepth_core.rig.poses import Pose
 from cvcdepth_core.rig.view import PicturePart
 from cvcdepth_core.scoring.confidence_scores import ConfidenceScorer, ConfidenceScores
 from cvcdepth_core.scoring.consistency import AgreementTable, spatial_rows, temporal_rows
 from cvcdepth_core.scoring.ground_truth import overlap_pixels, sample_prediction
+from cvcdepth_core.scoring.obstacles import ObstacleScorer, ObstacleScores
 from cvcdepth_core.scoring.scorer import DepthSamples, SurroundScorer
 from cvcdepth_core.scoring.scores import Scores
+from cvcdepth_core.scoring.sky import SkyCounts, sky_counts
 from cvcdepth_core.scoring.sparse_depth import SparseDepth
 from cvcdepth_core.stamps import NANOSECONDS
+from cvcdepth_core.surround_depth import SkyChoice
 from cvcdepth_core.visualization import Points
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.evaluation.job import EvaluationJob
 from cvcdepth_ros.evaluation.pose_scores import PoseScoring
 from cvcdepth_ros.evaluation.references import ReferenceScores, ReferenceScoring
 from cvcdepth_ros.messages.cloud_sources import describe_left_out_clouds
+from cvcdepth_ros.recordings.ground import RecordedGround, with_ground
 from cvcdepth_ros.recordings.replay import DepthReplay, RecordedImage, SurroundReplay
 from cvcdepth_ros.recordings.rig import RecordedRig
 from cvcdepth_ros.recordings.true_depth import RecordedDepthImages
@@ -43,7 +47,7 @@ from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet
 Progress = Callable[[float], None]
 """Called with the share of the recording that is done."""
 
-_CONFIDENCE = "confidence_"  # before the names of its arrays
+_CONFIDENCE, _OBSTACLES = "confidence_", "obstacles_"  # before the names of their arrays
 _REFINED_BY_NS = 4 * NANOSECONDS  # of earlier sets, those that depth is refined with and one more second
 _LONGEST_STEP_NS = NANOSECONDS  # between two sets that are compared along the vehicle's way
 
@@ -59,6 +63,8 @@ class MeasuredSet:
     """The vehicle's pose at each camera's moment; None where it is not recorded."""
     lidar: Points | None
     """[M, 3] metres in the base frame at the anchor's moment."""
+    sky_choice: SkyChoice = "keep"
+    """How depth is scored in the sky."""
 
     @property
     def stamp_ns(self) -> int:
@@ -86,23 +92,28 @@ class MeasuredSet:
         rig, depth = self.estimated.rig, self.estimated.result.depth
         views = {camera.name: camera.rectified_view for camera in rig.cameras}
         found = []
-        for name, truth, prediction, part in zip(rig.names, self.truth, depth, self.parts, strict=True):
+        for name, truth, prediction, sky, part in zip(rig.names, self.truth, depth, self._sky, self.parts, strict=True):
             others = [views[other] for other in rig.neighbours[name]]
             overlap = overlap_pixels(truth, views[name], others)
             sampled = sample_prediction(prediction, truth, part)
+            if self.sky_choice != "keep":
+                in_sky = sample_prediction(sky.astype(np.float32), truth, part) > 0.5
+                sampled[in_sky] = np.inf if self.sky_choice == "far" else np.nan
             found.append(DepthSamples(sampled, truth.depth, overlap, truth.parts))
         return found
 
-    def sky(self, far: float) -> tuple[int, int]:
-        """Return the pixels with depth that show the sky, and those among them whose depth is beyond `far` metres."""
-        pixels = seen = 0
-        for truth, prediction, part in zip(self.truth, self.estimated.result.depth, self.parts, strict=True):
-            rows, columns = truth.sky.T
-            sky = SparseDepth(rows, columns, np.zeros(len(rows)), truth.height, truth.width)
-            there = sample_prediction(prediction, sky, part)
-            pixels += int((~np.isnan(there)).sum())
-            seen += int((there > far).sum())
-        return pixels, seen
+    def sky(self, far: float) -> SkyCounts:
+        """Return how the sky was seen; depth of it is far beyond `far` metres."""
+        counts = SkyCounts()
+        for truth, depth, sky, part in zip(self.truth, self.estimated.result.depth, self._sky, self.parts, strict=True):
+            counts += sky_counts(truth, depth, sky, part, far)
+        return counts
+
+    @property
+    def _sky(self) -> NDArray[np.bool_]:
+        """[N, H, W]; nowhere, where nobody looked for it."""
+        result = self.estimated.result
+        return np.zeros(result.depth.shape, np.bool_) if result.sky is None else result.sky
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,6 +130,8 @@ class RecordingScores:
     references: Mapping[str, ReferenceScores]
     """What looks at no picture, by `REFERENCES`; flat ground is missing where the ground is not below every camera."""
     confidence: ConfidenceScores | None = None
+    """None where it was not computed."""
+    obstacles: ObstacleScores | None = None
     """None where it was not computed."""
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
@@ -137,6 +150,8 @@ class RecordingScores:
         arrays = {f"agreement_{name}": found.agreement.columns for name, found in self.references.items()}
         if self.confidence is not None:
             arrays |= {f"{_CONFIDENCE}{name}": found for name, found in self.confidence.to_arrays().items()}
+        if self.obstacles is not None:
+            arrays |= {f"{_OBSTACLES}{name}": found for name, found in self.obstacles.to_arrays().items()}
         return {"described": text, "agreement": self.agreement.columns, "log_times": self.log_times, **arrays}
 
     @classmethod
@@ -157,28 +172,39 @@ class RecordingScores:
             AgreementTable(map(tuple, described["pairs"]), arrays["agreement"]),
             arrays["log_times"],
             references,
-            _confidence_from(arrays),
+            ConfidenceScores.from_arrays(confidence) if (confidence := _named(arrays, _CONFIDENCE)) else None,
+            ObstacleScores.from_arrays(obstacles) if (obstacles := _named(arrays, _OBSTACLES)) else None,
         )
 
 
-def _confidence_from(arrays: Mapping[str, NDArray[Any]]) -> ConfidenceScores | None:
-    found = {name.removeprefix(_CONFIDENCE): array for name, array in arrays.items() if name.startswith(_CONFIDENCE)}
-    return ConfidenceScores.from_arrays(found) if found else None
+def _named(arrays: Mapping[str, NDArray[Any]], before: str) -> dict[str, NDArray[Any]]:
+    return {name.removeprefix(before): array for name, array in arrays.items() if name.startswith(before)}
 
 
 class RecordingEvaluation:
     """One opened recording, ready to be measured; make it with `open_evaluation`."""
 
-    def __init__(self, job: EvaluationJob, recorded: RecordedRig, predictor: DepthPredictor | None = None) -> None:
-        """`predictor` is the job's where it is loaded already; without it, it is loaded here."""
+    def __init__(
+        self,
+        job: EvaluationJob,
+        recorded: RecordedRig,
+        predictor: DepthPredictor | None = None,
+        ground: RecordedGround | None = None,
+    ) -> None:
+        """`predictor` and `ground` are the job's and the rig's where they are known; else they are looked for here."""
         self.job = job
+        if predictor is None and job.settings.predictor is None:
+            predictor = job.settings.build_estimator()
+        if ground is None:
+            recorded, ground = _with_ground(job, recorded, predictor)
+        self.ground = ground
         self.replay = SurroundReplay(recorded, job.settings)
         self.truth = _truth(job, recorded)
         self.depths = DepthReplay(
             self.replay,
             predictor or job.settings.build_predictor(self.replay.rig),
             settings=job.settings.replayed,
-            wants_confidence=job.settings.has_confidence,
+            wants_confidence=job.settings.confidence,
         )
 
     @property
@@ -221,7 +247,7 @@ class RecordingEvaluation:
 
         It is matched anew from shortly before it, by the rig and the network of this evaluation.
         """
-        anew = RecordingEvaluation(self.job, self.replay.recorded, self.depths.estimator)
+        anew = RecordingEvaluation(self.job, self.replay.recorded, self.depths.estimator, self.ground)
         before = _REFINED_BY_NS if self.depths.refinement.is_active else 2 * NANOSECONDS
         for measured in anew.sets(log_time - before, log_time + NANOSECONDS, stamp_ns):
             return measured
@@ -239,7 +265,15 @@ class RecordingEvaluation:
             poses = self.truth.base_poses(rig, surround_set.times_ns)
             lidar = self.truth.points(surround_set.time_ns)
             self.truth.forget_before(min(surround_set.times_ns.values()))
-        return MeasuredSet(estimated, truth, poses, lidar)
+        return MeasuredSet(estimated, truth, poses, lidar, self.job.settings.sky)
+
+
+def _with_ground(
+    job: EvaluationJob, recorded: RecordedRig, network: DepthPredictor | None
+) -> tuple[RecordedRig, RecordedGround]:
+    """Look for the ground; in pictures, which takes seconds, only for depth that depends on it."""
+    depends = job.settings.predictor == "ground_plane" or (network is not None and is_told_its_rig(network))
+    return with_ground(recorded, job.lidar, job.settings.ground_height, with_pictures=depends)
 
 
 def _truth(job: EvaluationJob, recorded: RecordedRig) -> RecordedTruth | RecordedDepthImages:
@@ -305,13 +339,14 @@ class _Scoring:
         self._latencies = latencies
         self._scorer = SurroundScorer(job.name, cameras, job.settings.scores)
         self._confidence = ConfidenceScorer(cameras, job.settings.min_depth, job.settings.max_depth)
+        self._obstacles = ObstacleScorer()
         self._agreement = AgreementTable()
         self._earlier: tuple[int, PosedDepth] | None = None
         self.poses = PoseScoring(job.settings.checkpoint_path)
         self._log_times = array("q")
         self.sets_with_truth = 0
         self.truth_points = 0
-        self.sky = np.zeros(2, np.int64)
+        self.sky = SkyCounts()
 
     def add(self, measured: MeasuredSet) -> None:
         """Score one set; sets come in order."""
@@ -320,8 +355,10 @@ class _Scoring:
             points = self._scorer.add(measured.stamp_ns, samples)
             self.references.add(measured.stamp_ns, samples, measured.truth)
             self._confidence.add(measured.estimated.result, measured.truth, measured.parts)
+        with self._latencies.measure("obstacles"):
+            self._add_obstacles(measured)
         self.truth_points += points
-        if self._job.settings.truth == "depth":
+        if points:
             self.sky += measured.sky(self._job.settings.max_depth)
         self.sets_with_truth += points > 0
         with self._latencies.measure("label-free"), torch.inference_mode():
@@ -339,8 +376,16 @@ class _Scoring:
         """Return what was found."""
         log_times = np.array(self._log_times, dtype=np.int64)
         scores, references = self._scorer.scores(), self.references.result()
-        confidence = self._confidence.scores()
-        return RecordingScores(self._job.name, summary, scores, self._agreement, log_times, references, confidence)
+        confidence, obstacles = self._confidence.scores(), self._obstacles.scores()
+        return RecordingScores(
+            self._job.name, summary, scores, self._agreement, log_times, references, confidence, obstacles
+        )
+
+    def _add_obstacles(self, measured: MeasuredSet) -> None:
+        estimated, poses = measured.estimated, measured.world_T_base
+        surround_set, rig = estimated.surround_set, estimated.rig
+        pose = None if poses is None else poses[rig.names.index(surround_set.anchor)]
+        self._obstacles.add(estimated.result, rig, measured.truth, pose, surround_set.time_ns)
 
     def _compare(self, measured: MeasuredSet) -> None:
         stamp, rig, posed = measured.stamp_ns, measured.estimated.rig, measured.posed
@@ -380,7 +425,8 @@ def _summary(evaluation: RecordingEvaluation, scoring: _Scoring) -> dict[str, An
         "truth_points": scoring.truth_points,
         "pose_network": scoring.poses.result(),
         "why_no_pose_network": scoring.poses.problem or None,
-        "sky": {"pixels": int(scoring.sky[0]), "far": int(scoring.sky[1])},
+        "sky": scoring.sky.to_json(),
+        "ground": {**evaluation.ground.to_json(), "told_to_network": is_told_its_rig(depths.estimator)},
         "no_flat_ground": scoring.references.problem or None,
         "refused": depths.refused.reasons + replay.unreadable.reasons,
         "truth_refused": {"count": truth.refused.count, "reasons": truth.refused.reasons[:10]},

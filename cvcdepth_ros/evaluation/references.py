@@ -92,7 +92,7 @@ class ReferenceScoring:
     def _ground_depth(self, job: EvaluationJob, rig: Rig, size: tuple[int, int]) -> NDArray[np.float32] | None:
         """Return flat ground's depth [N, H, W]; None where the ground is not below every camera."""
         try:
-            return ground_plane_depth(rig, job.settings.ground_height, job.settings.max_depth, *size).depth
+            return ground_plane_depth(rig, rig.ground_z, job.settings.max_depth, *size).depth
         except ConfigError as error:
             self.problem = str(error)
             return None
@@ -116,8 +116,9 @@ class ReferenceScoring:
 
 def reference_titles(configuration: Mapping[str, Any]) -> dict[str, str]:
     """Return each reference's title in tables, by an evaluation's configuration."""
+    height = configuration["ground_height"]
     return {
         CONSTANT: f"constant {configuration['constant_depth']:g} m",
         BEST_CONSTANT: "best constant",
-        GROUND: f"ground at {configuration['ground_height']:g} m",
+        GROUND: "flat ground" if height is None else f"ground at {height:g} m",
     }

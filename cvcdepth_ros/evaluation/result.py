@@ -17,6 +17,7 @@ from cvcdepth_core.networks.checkpoint import load_checkpoint
 from cvcdepth_core.scoring.comparison import Comparison, compare
 from cvcdepth_core.scoring.confidence_scores import ConfidenceScores
 from cvcdepth_core.scoring.consistency import AgreementTable, summarise_agreement
+from cvcdepth_core.scoring.obstacles import ObstacleScores
 from cvcdepth_core.scoring.scores import ALL, SCALINGS, EvaluationProtocol, Scaling, Score, Scores, Summary
 from cvcdepth_core.training.pose_network import PoseScore, pose_score_to_json
 from cvcdepth_ros.evaluation.image_scores import (
@@ -163,6 +164,12 @@ class EvaluationResult:
         found = [recording.confidence for recording in self.recordings if recording.confidence is not None]
         return ConfidenceScores.merged(found) if found else None
 
+    @cached_property
+    def obstacles(self) -> ObstacleScores | None:
+        """How a robot would feel it; None where that was not measured."""
+        found = [recording.obstacles for recording in self.recordings if recording.obstacles is not None]
+        return ObstacleScores.merged(found) if found else None
+
     @property
     def pose_score(self) -> PoseScore | None:
         """The checkpoint's pose network beside recorded motion; None where one of the two is missing."""
@@ -186,6 +193,7 @@ class EvaluationResult:
             "scale_ratio": {p: nan_to_null(self.scores.scale_ratios(p)) for p in PROTOCOLS},
             "label_free": self._label_free(),
             "confidence": self.confidence.to_json() if self.confidence else None,
+            "obstacles": self.obstacles.to_json() if self.obstacles else None,
             "pose_network": pose_score_to_json(self.pose_score),
             "references": {name: reference.to_json() for name, reference in self.references.items()},
             "recordings": [recording.summary for recording in self.recordings],

@@ -42,7 +42,8 @@ def _sets_digest(index: RecordingIndex) -> str:
 
 def _rig_digest(layout: RigLayout) -> str:
     cameras = tuple(camera.model_copy(update={"mask": None}) for camera in layout.cameras)
-    return _digest(layout.model_copy(update={"cameras": cameras}).model_dump_json().encode())
+    told = {"cameras": cameras, "ground_height": layout.ground_z}
+    return _digest(layout.model_copy(update=told).model_dump_json().encode())
 
 
 def _masks(layout: RigLayout) -> str:

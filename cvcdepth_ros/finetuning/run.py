@@ -148,8 +148,6 @@ def _warn_of_losses(prepared: Prepared, job: FinetuneJob, warn: Callable[[str], 
     for index in prepared.indexes:
         if told := describe_skipped_samples(index, job.config.recordings):
             prepared.warnings.append(f"{index.path}: {told}")
-        if job.config.recordings.motion == "auto" and index.poses is None:
-            prepared.warnings.append(f"{index.path}: no motion is recorded, so the pose network's is taken")
     for text in (*(f"left out: {reason}" for reason in prepared.left_out.values()), *prepared.warnings):
         warn(text)
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from cvcdepth_core.errors import ConfigError, ImageError
 from cvcdepth_core.images.decoding import Picture, Reduction, decode_compressed, decode_raw, reduce_picture
+from cvcdepth_core.obstacles.scan import Scan
 from cvcdepth_core.rig.calibration import Calibration
 from cvcdepth_core.rig.poses import Pose, quaternion_from_rotation
 from cvcdepth_core.stamps import NANOSECONDS
@@ -141,6 +142,21 @@ class MessageFactory:
             row_step=point_step * width,
             data=self._bytes(cloud),
             is_dense=cloud.ndim == 2,
+        )
+
+    def laser_scan(self, stamp: int, frame_id: str, scan: Scan) -> Any:
+        """Build the LaserScan of a scan whose beams were all measured at once."""
+        return self._class("sensor_msgs/msg/LaserScan")(
+            header=self._header(stamp, frame_id),
+            angle_min=scan.angle_min,
+            angle_max=scan.angle_min + scan.increment * (len(scan.ranges) - 1),
+            angle_increment=scan.increment,
+            time_increment=0.0,
+            scan_time=0.0,
+            range_min=scan.range_min,
+            range_max=scan.range_max,
+            ranges=scan.ranges,
+            intensities=np.zeros(0, np.float32),
         )
 
     def odometry(

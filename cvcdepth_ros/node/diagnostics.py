@@ -8,6 +8,9 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from cvcdepth_core.estimator import DepthEstimator
+from cvcdepth_core.obstacles.ground import GroundPlane
+from cvcdepth_core.rig.ground import is_on_ground, unstated_ground
+from cvcdepth_core.rig.rig_file import RigLayout
 from cvcdepth_core.rig_health.overlap_monitor import OverlapMonitor
 from cvcdepth_ros.live.camera_states import CameraCondition, CameraState, CameraWatch
 from cvcdepth_ros.live.mailbox import MailboxStatistics
@@ -99,6 +102,20 @@ def model_status(estimator: DepthEstimator) -> DiagnosticStatus:
     return status(OK, "model", estimator.model_id, values)
 
 
+def ground_status(layout: RigLayout) -> DiagnosticStatus:
+    """Return how high the ground lies for networks that are told it, and what helps where nobody says it."""
+    values = {f"ground in {layout.base_frame} (m)": layout.ground_z}
+    problem = ground_problem(layout)
+    told = f"{layout.ground_z:.2f} m in {layout.base_frame}"
+    return status(WARN if problem else OK, "ground", problem or told, values)
+
+
+def ground_problem(layout: RigLayout) -> str:
+    """Return that nobody says how high the ground lies, with the remedy; empty where somebody does."""
+    is_known = layout.ground_height is not None or is_on_ground(layout.base_frame)
+    return "" if is_known else unstated_ground(layout.base_frame)
+
+
 def overlap_status(monitor: OverlapMonitor) -> DiagnosticStatus:
     """Return how well neighbouring cameras agree, pair by pair, and which of them have changed."""
     values: dict[str, Any] = {}
@@ -125,6 +142,12 @@ def refinement_status(stage: RefinementStage, motion: VehiclePoses) -> Diagnosti
         values[f"{name}: neighbours"] = int(beside)
     problem = refined.odometry_problem or motion.problem
     return status(WARN if problem else OK, "refinement", problem or _EVIDENCE[refined.source], values)
+
+
+def ground_plane_status(ground: GroundPlane) -> DiagnosticStatus:
+    """Return where the ground was taken to be in the last set whose obstacles were asked for."""
+    values = {"height (m)": ground.height, "slope along x": ground.slope_x, "slope along y": ground.slope_y}
+    return status(OK if ground.is_fitted else WARN, "ground plane", ground.describe(), values)
 
 
 def _text(value: Any) -> str:

@@ -11,12 +11,18 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from cvcdepth_core.errors import ConfigError
-from cvcdepth_core.pointcloud import CloudLimits
+from cvcdepth_core.obstacles.ground import GroundPlane
 from cvcdepth_ros.messages.conversion import ros_message_class, ros_message_factory
 from cvcdepth_ros.node.qos import refusing_impossible_qos
 from cvcdepth_ros.settings import NodeParameters
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
-from cvcdepth_ros.surround_sets.output_messages import CONFIDENCE, SurroundMessages, camera_topics, output_types
+from cvcdepth_ros.surround_sets.output_messages import (
+    CONFIDENCE,
+    OutputLimits,
+    SurroundMessages,
+    camera_topics,
+    output_types,
+)
 from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet
 
 
@@ -29,7 +35,7 @@ class SurroundOutputs:
         self._node = node
         self._latencies = latencies
         self._messages = SurroundMessages(
-            ros_message_factory(), parameters.depth_encoding, parameters.depth_min_confidence
+            ros_message_factory(), parameters.depth_encoding, parameters.depth_min_confidence, parameters.sky
         )
         self._publishers: dict[str, Publisher] = {}
         try:
@@ -47,7 +53,12 @@ class SurroundOutputs:
         """Return whether any camera's confidence is subscribed."""
         return any(self._has_subscribers(f"{camera}/{CONFIDENCE}") for camera in self._cameras)
 
-    def publish(self, estimated: EstimatedSet[Any], frame_ids: Mapping[str, str], limits: CloudLimits) -> None:
+    @property
+    def ground(self) -> GroundPlane | None:
+        """The ground of the last set whose obstacles were asked for; None before any."""
+        return self._messages.ground
+
+    def publish(self, estimated: EstimatedSet[Any], frame_ids: Mapping[str, str], limits: OutputLimits) -> None:
         """Publish one set; see `SurroundMessages.of_set` for stamps and frames.
 
         Each message leaves as soon as it is built: depth does not wait for the clouds.

@@ -26,6 +26,9 @@ from cvcdepth_ros.messages.conversion import stamp_ns
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
 from cvcdepth_ros.node.diagnostics import (
     camera_status,
+    ground_plane_status,
+    ground_problem,
+    ground_status,
     inference_status,
     model_status,
     overlap_status,
@@ -39,6 +42,7 @@ from cvcdepth_ros.node.rig_transforms import RigTransforms
 from cvcdepth_ros.node.subscriptions import CameraInputs, StaticTransformInput
 from cvcdepth_ros.settings import NodeParameters
 from cvcdepth_ros.surround_sets.latencies import StageLatencies
+from cvcdepth_ros.surround_sets.output_messages import OutputLimits
 from cvcdepth_ros.surround_sets.refinement import RefinementStage
 from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet
 from cvcdepth_ros.surround_sets.synchronizer import SurroundSynchronizer
@@ -92,7 +96,12 @@ class SurroundSession:
             motion = MotionInput(node, layout.base_frame, parameters.odometry_topic)
             self._motion = opened.enter_context(closing(motion))
             self._refinement = RefinementStage(
-                parameters, motion.poses.poses_at, self._wants_confidence, self.latencies, parameters.publish_odometry
+                parameters,
+                motion.poses.poses_at,
+                self._wants_confidence,
+                self.latencies,
+                parameters.publish_odometry,
+                lambda: bool(motion.poses.topic),
             )
             self._pipeline = SurroundPipeline(
                 estimator,
@@ -112,6 +121,7 @@ class SurroundSession:
             self._opened = opened.pop_all()
         for line in unknown_qos_overrides(node, self._inputs.image_topics):
             node.get_logger().warning(line)
+        self._warn_of_unstated_ground()
 
     def _rig_transforms(self, opened: ExitStack) -> RigTransforms | None:
         """Return what publishes poses that only the rig has; None where there are none, or without tf2_msgs."""
@@ -129,7 +139,7 @@ class SurroundSession:
     def poll(self) -> None:
         """Subscribe image topics that have appeared, and follow how far the sets come. To be called regularly."""
         self._inputs.connect()
-        if self._refinement.is_active:
+        if self._refinement.needs_motion:
             self._motion.connect()
         if self._transforms is not None:
             self._transforms.poll()
@@ -141,6 +151,7 @@ class SurroundSession:
         """Use another network from the next set on; EngineError when it cannot run."""
         self._pipeline.set_model(estimator)
         self._estimator = estimator
+        self._warn_of_unstated_ground()
         self._monitored_rig = None  # what was usual for the former network need not be for this one
 
     def resume_listening(self) -> None:
@@ -220,9 +231,16 @@ class SurroundSession:
                 self.latencies.summaries(), mailbox, self.problem, self._estimator.model_id, self.unknown_latencies
             ),
             model_status(self._estimator),
+            *([ground_status(self._assembler.layout)] if self._estimator.spec.is_told_its_rig else []),
             *([overlap_status(self._overlaps)] if self._overlaps else []),
+            *([ground_plane_status(self._outputs.ground)] if self._outputs.ground else []),
             *([refinement_status(self._refinement, self._motion.poses)] if self._refinement.is_active else []),
         ]
+
+    def _warn_of_unstated_ground(self) -> None:
+        problem = ground_problem(self._assembler.layout)
+        if problem and self._estimator.spec.is_told_its_rig:
+            self._node.get_logger().warning(problem)
 
     def _setup_troubles(self, camera: str) -> list[Trouble]:
         """Return what the camera still lacks before its images can be used."""
@@ -276,7 +294,7 @@ class SurroundSession:
         frame_ids = {name: self._assembler.view_frame_id(name) or "" for name in published.rig.names}
         parameters = read_parameters(self._node)
         self._needs_confidence = parameters.needs_confidence
-        self._outputs.publish(published, frame_ids, parameters.cloud_limits)
+        self._outputs.publish(published, frame_ids, OutputLimits.of(parameters))
         newest = max(published.surround_set.times_ns.values())
         self._ages.record("age of newest image at publish (ROS time)", "", newest)
 

@@ -34,6 +34,8 @@ from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet
 Progress = Callable[[float], None]
 """Called with the share that is done."""
 
+_FOR_MOUNTS = RefinementSettings(max_grid_width=320, use_neighbours=False)
+_FOR_MOTION = RefinementSettings(use_neighbours=False, distances=())  # nothing is refined
 _TRUSTED = 0.65  # confidence of depth that mounts are looked for with
 _WARM_UP = 4  # sets of a part that only fill the history
 _EVERY = 2  # of the others is searched
@@ -61,6 +63,15 @@ class ComparedPictures:
     """Whether there were enough sets in a row to know whether it fits."""
 
 
+class JudgedOdometry(NamedTuple):
+    """What the pictures say of a recording's odometry."""
+
+    problem: str
+    """What is wrong with it; empty where it fits, or too little is known."""
+    is_usable: bool
+    """False where the pictures contradict it in more than its scale, which depth may have wrong."""
+
+
 def parts_of(start: int, stop: int, count: int, seconds: float) -> list[Part]:
     """Return `count` parts of so many seconds, spread evenly over the time from start to stop (ns), or all of it."""
     length = round(seconds * NANOSECONDS)
@@ -82,7 +93,7 @@ def compare_pictures(
     problems: list[str] = []
     sets, is_judged = 0, False
     for number, part in enumerate(parts):
-        found = _Compared(recorded, predictor, matching, search)
+        found = _Compared(recorded, predictor, matching, _FOR_MOUNTS, search)
         sets += found.look_at(part)
         problems += [found.problem] if found.problem else []
         is_judged |= found.has_judged_odometry
@@ -93,6 +104,18 @@ def compare_pictures(
         )
     problem = problems[0] if problems else ""
     return ComparedPictures(rig, sets, search.result(), problem, recorded.vehicle_motion() is not None, is_judged)
+
+
+def judge_odometry(
+    recorded: RecordedRig, predictor: DepthPredictor, parts: list[Part], matching: MatchingSettings
+) -> JudgedOdometry:
+    """Compare recorded motion with the pictures of these parts, by the predictor's own depth."""
+    problem, is_usable = "", True
+    for part in parts:
+        found = _Compared(recorded, predictor, matching, _FOR_MOTION)
+        found.look_at(part)
+        problem, is_usable = problem or found.problem, is_usable and not found.contradicts_odometry
+    return JudgedOdometry(problem, is_usable)
 
 
 def turned_layout(layout: RigLayout, mounts: RefinedMounts) -> RigLayout:
@@ -153,12 +176,18 @@ class _Compared:
     """One part of a recording, refined from its beginning."""
 
     def __init__(
-        self, recorded: RecordedRig, predictor: DepthPredictor, matching: MatchingSettings, search: MountSearch
+        self,
+        recorded: RecordedRig,
+        predictor: DepthPredictor,
+        matching: MatchingSettings,
+        settings: RefinementSettings,
+        search: MountSearch | None = None,
     ) -> None:
         self._depths = DepthReplay(SurroundReplay(recorded, matching), predictor)
         self._motion = RecordedSetMotion.of(recorded)
-        grid = RefinementSettings(max_grid_width=320, use_neighbours=False)
-        self._refiner = DriveRefiner(self._depths.surround.rig.neighbour_indices, grid)
+        self._refiner = DriveRefiner(
+            self._depths.surround.rig.neighbour_indices, settings, follows_always=search is None
+        )
         self._search = search
         self.problem = ""
 
@@ -166,14 +195,18 @@ class _Compared:
     def has_judged_odometry(self) -> bool:
         return self._refiner.has_judged_odometry
 
+    @property
+    def contradicts_odometry(self) -> bool:
+        return self._refiner.contradicts_odometry
+
     def look_at(self, part: Part) -> int:
-        """Search every second set; return how many there are."""
+        """Take in all sets, every second one also for the search; return how many there are."""
         number = -1
         for number, estimated in enumerate(self._estimated(part)):
             moment = moment_of(self._depths.surround, estimated.surround_set, estimated.result, self._poses(estimated))
             found = self._refiner.refine(moment)
             self.problem = found.odometry_problem or self.problem
-            if number >= _WARM_UP and number % _EVERY == 0:
+            if self._search is not None and number >= _WARM_UP and number % _EVERY == 0:
                 trusted = np.where(found.depth.confidence > _TRUSTED, found.depth.depth, np.float32(np.nan))
                 self._search.add(replace(moment, world_T_base=found.world_T_base), trusted)
         return number + 1

@@ -19,8 +19,12 @@ from cvcdepth_ros.recordings.rig_messages import STATIC_TRANSFORMS
 from cvcdepth_ros.settings import OutputSettings
 from cvcdepth_ros.surround_sets.output_messages import (
     CONFIDENCE,
+    GROUND,
     MERGED_CAMERAS,
     MERGED_CLOUD,
+    OBSTACLES,
+    SCAN,
+    OutputLimits,
     SurroundMessages,
     output_types,
 )
@@ -47,6 +51,7 @@ class DepthRecorder:
         clouds: CloudChoice,
         start: int,
         has_confidence: bool = False,
+        obstacles: bool = False,
     ) -> None:
         """Create the folder, announce the topics and write the fixed transforms at the log time `start` (ns).
 
@@ -55,12 +60,14 @@ class DepthRecorder:
         """
         self._replay = replay
         self._settings = settings
-        self._messages = SurroundMessages(bag_message_factory(), settings.depth_encoding, settings.depth_min_confidence)
+        self._messages = SurroundMessages(
+            bag_message_factory(), settings.depth_encoding, settings.depth_min_confidence, settings.sky
+        )
         types = output_types(replay.layout.names)
         self._topics = {
             topic: type_
             for topic, type_ in types.items()
-            if _is_wanted(topic, type_, clouds) and (has_confidence or not topic.endswith(CONFIDENCE))
+            if _is_wanted(topic, type_, clouds, obstacles) and (has_confidence or not topic.endswith(CONFIDENCE))
         }
         static_transforms = self._static_transforms(start)
         self._writer = RecordingWriter(path)
@@ -79,7 +86,7 @@ class DepthRecorder:
 
     def write(self, estimated: EstimatedSet[RecordedImage]) -> None:
         """Write one set."""
-        limits, frame_ids = self._settings.cloud_limits, self._replay.frame_ids
+        limits, frame_ids = OutputLimits.of(self._settings), self._replay.frame_ids
         for output in self._messages.of_set(estimated, frame_ids, limits, self._topics.__contains__):
             log_time = estimated.surround_set.images[output.camera].log_time
             self._writer.write(f"{_NODE}/{output.topic}", log_time, output.message)
@@ -118,7 +125,9 @@ class DepthRecorder:
             return False
 
 
-def _is_wanted(topic: str, type_: str, clouds: CloudChoice) -> bool:
+def _is_wanted(topic: str, type_: str, clouds: CloudChoice, obstacles: bool) -> bool:
+    if topic in (OBSTACLES, GROUND, SCAN):
+        return obstacles
     if topic in (MERGED_CLOUD, MERGED_CAMERAS):
         return clouds != "none"
     return type_ != POINT_CLOUD_TYPE or clouds == "all"

@@ -28,6 +28,16 @@ class LidarSweep(NamedTuple):
     """[M, 3] metres in the LiDAR's frame."""
 
 
+def read_sweep(topic: str, message: Any, base_frame: str, static: TransformTree) -> LidarSweep:
+    """Return the sweep of a LiDAR's message; raises as `LidarSweeps.add`."""
+    points = points_from_message(message, topic)
+    try:
+        base_T_lidar = static.lookup(base_frame, message.header.frame_id)
+    except TransformError as error:
+        raise TransformError(f"{topic}: {error}") from error
+    return LidarSweep(stamp_ns(message), base_T_lidar, points)
+
+
 class LidarSweeps:
     """The recent sweeps of one or several LiDARs, brought to the base frame at any moment."""
 
@@ -57,12 +67,7 @@ class LidarSweeps:
         Raises RecordingError, naming the topic and the field, when it cannot be read, and TransformError, naming the
         topic and the frame, when that has no transform to the base frame.
         """
-        points = points_from_message(message, topic)
-        try:
-            base_T_lidar = self._static.lookup(self._base_frame, message.header.frame_id)
-        except TransformError as error:
-            raise TransformError(f"{topic}: {error}") from error
-        self._sweeps[topic].append(LidarSweep(stamp_ns(message), base_T_lidar, points))
+        self._sweeps[topic].append(read_sweep(topic, message, self._base_frame, self._static))
 
     def points_at(self, stamp: int) -> NDArray[np.float64] | None:
         """Return each LiDAR's sweep nearest to `stamp` (ns), moved to then; None without any within the tolerance.

@@ -199,13 +199,15 @@ class DepthReplay:
         self.estimator = estimator
         self._replay = replay
         self._surround = SurroundDepthEstimator(replay.rig, estimator)
-        is_compared = wants_confidence or (settings is not None and settings.refine != "off")
-        self._motion = RecordedSetMotion.of(replay.recorded) if is_compared else None
+        settings = settings or ModelSettings.model_validate({"refine": "off"})
+        is_compared = wants_confidence or settings.refine != "off"
+        self._motion = motion = RecordedSetMotion.of(replay.recorded) if is_compared else None
         self.refinement = RefinementStage(
-            settings or ModelSettings.model_validate({"refine": "off"}),
-            self._motion.poses_at if self._motion else lambda _: None,
+            settings,
+            motion.poses_at if motion else lambda _: None,
             lambda: wants_confidence,
             self.latencies,
+            knows_motion=lambda: motion is not None,
         )
 
     def sets(

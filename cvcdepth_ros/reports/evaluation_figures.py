@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from cvcdepth_core.scoring.confidence import CalibrationTable
+from cvcdepth_core.scoring.obstacles import RANGES, THRESHOLDS, ObstacleScores
 from cvcdepth_core.scoring.scores import ALL, OVERLAP, Score
 from cvcdepth_ros.evaluation.image_scores import SetScore
 from cvcdepth_ros.evaluation.result import EvaluationResult
@@ -81,6 +82,24 @@ def calibration_curve(table: CalibrationTable) -> bytes:
     add_title(axes, "how often depth is right, by its confidence")
     axes.set_xlabel("confidence", color=TEXT)
     axes.set_ylim(0, 1.05)
+    add_legend(axes)
+    return to_png(figure)
+
+
+def obstacles_by_confidence(obstacles: ObstacleScores) -> bytes:
+    """Draw recall over precision of obstacles within each range, a point for each confidence that is asked for."""
+    figure, (axes,) = dark_figure(6.4, 3.4)
+    told = obstacles.told_thresholds
+    recall, precision = obstacles.recall()[told], obstacles.precision()[told]
+    for i, (metres, colour) in enumerate(zip(RANGES, (GREEN, YELLOW, BLUE), strict=True)):
+        axes.plot(precision[:, i], recall[:, i], color=colour, marker="o", label=f"within {metres:g} m")
+    for place, least in enumerate(np.array(THRESHOLDS)[told].tolist()):
+        axes.annotate(f"{least:g}", (precision[place, -1], recall[place, -1]), color=TEXT, fontsize=7)
+    add_title(axes, "obstacles: recall over precision, by least confidence")
+    axes.set_xlabel("precision", color=TEXT)
+    axes.set_ylabel("recall", color=TEXT)
+    axes.set_xlim(0, 1.02)
+    axes.set_ylim(0, 1.02)
     add_legend(axes)
     return to_png(figure)
 

@@ -58,6 +58,7 @@ def render(result: EvaluationResult, shown: Sequence[ShownSet]) -> str:
         "groups": _group_titles(result),
         "agreement": summarise_agreement(result.agreement),
         "correlations": correlations(result.sets),
+        "obstacles": result.obstacles.to_json() if result.obstacles else None,
         "figures": _figures(result),
         "error_legend": _error_legend(),
         "depth_legend": _depth_legend(result),
@@ -96,6 +97,8 @@ def _group_titles(result: EvaluationResult) -> dict[str, str]:
 def _figures(result: EvaluationResult) -> dict[str, bytes]:
     """Return the diagrams that have anything to show, as PNG."""
     series = {"series": figures.time_series(result.sets)}
+    if result.obstacles is not None and len(result.obstacles.told_thresholds) > 1:
+        series["obstacles"] = figures.obstacles_by_confidence(result.obstacles)
     if not result.truth_points:
         return series
     if result.confidence is not None:

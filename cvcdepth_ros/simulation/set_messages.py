@@ -7,12 +7,14 @@ from collections.abc import Iterator
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cvcdepth_core.rig.rig_file import CameraEntry, RigLayout
 from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_core.worlds.drive import DriveSpec, SimulatedDrive
 from cvcdepth_core.worlds.odometry import Told
 from cvcdepth_core.worlds.rendering.lidar import lidar_mount
+from cvcdepth_core.worlds.rendering.renderer import Truth
 from cvcdepth_ros.simulation.messages import (
     camera_info,
     compressed_image,
@@ -73,7 +75,7 @@ def _recorded(camera: CameraEntry, images: ImageForm) -> CameraEntry:
 
 
 def truth_topic(camera: str, what: str) -> str:
-    """Topic of a camera's truth: depth, objects or moving."""
+    """Topic of a camera's truth: depth, objects, moving, normals or flow."""
     return f"/camera/{camera}/truth/{what}"
 
 
@@ -105,14 +107,25 @@ def _camera_messages(drive: SimulatedDrive, camera: int, number: int, form: Form
         yield _stored(entry.image_topic, "compressed", stamp, packed)
     info = camera_info(stamp, frame, drive.rig.cameras[camera].calibration)
     yield _stored(entry.camera_info_topic, "info", stamp, info)
-    if form.truth != "none":
-        depth = image(stamp, frame, shot.truth.depth.astype("<f4"), "32FC1")
-        yield _stored(truth_topic(entry.name, "depth"), "image", stamp, depth)
-    if form.truth == "all":
-        objects = image(stamp, frame, shot.truth.objects.astype("<u2"), "mono16")
-        yield _stored(truth_topic(entry.name, "objects"), "image", stamp, objects)
-        moving = image(stamp, frame, shot.truth.moving.astype(np.uint8) * 255, "mono8")
-        yield _stored(truth_topic(entry.name, "moving"), "image", stamp, moving)
+    yield from _truth_messages(drive, camera, number, shot.truth, form.truth)
+
+
+def _truth_messages(
+    drive: SimulatedDrive, camera: int, number: int, truth: Truth, choice: TruthChoice
+) -> Iterator[Stored]:
+    entry = drive.spec.layout.cameras[camera]
+    images: dict[str, tuple[NDArray[Any], str]] = {}
+    if choice != "none":
+        images["depth"] = truth.depth.astype("<f4"), "32FC1"
+    if choice == "all":
+        images["objects"] = truth.objects.astype("<u2"), "mono16"
+        images["moving"] = truth.moving.astype(np.uint8) * 255, "mono8"
+        images["normals"] = truth.normals.astype("<f4"), "32FC3"
+        images["flow"] = drive.flow(camera, number, truth).astype("<f4"), "32FC2"
+    stamp = stamp_of(drive.spec.camera_time(drive.rig.cameras[camera], number))
+    for what, (pixels, encoding) in images.items():
+        content = image(stamp, entry.frame_id or entry.name, pixels, encoding)
+        yield _stored(truth_topic(entry.name, what), "image", stamp, content)
 
 
 def static_transforms(spec: DriveSpec) -> Stored:

@@ -3,24 +3,31 @@
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
-from cvcdepth_core.pointcloud import CloudLimits, merged_cloud, organised_cloud
+from cvcdepth_core.obstacles.ground import GroundPlane
+from cvcdepth_core.obstacles.scan import Scan, ScanLimits, scan_of
+from cvcdepth_core.obstacles.separation import ObstacleLimits, SeparatedCloud, separate
+from cvcdepth_core.pointcloud import Cloud, CloudLimits, banded, merged_cloud, organised_cloud, thinned
 from cvcdepth_core.refinement.drive import VisualMotion
 from cvcdepth_core.rig.rig import Rig
-from cvcdepth_core.surround_depth import SurroundDepth
+from cvcdepth_core.surround_depth import SkyChoice, SurroundDepth
 from cvcdepth_ros.messages.camera_discovery import CAMERA_INFO_TYPE, IMAGE_TYPE
 from cvcdepth_ros.messages.conversion import Covariances, MessageFactory
 from cvcdepth_ros.messages.point_clouds import POINT_CLOUD_TYPE
 from cvcdepth_ros.messages.vehicle_motion import ODOMETRY_TYPE
+from cvcdepth_ros.settings import OutputSettings
 from cvcdepth_ros.surround_sets.set_estimation import EstimatedSet
 
 _VISUAL_WORLD = "visual_odom"
 
 STRING_TYPE = "std_msgs/msg/String"
+SCAN_TYPE = "sensor_msgs/msg/LaserScan"
 
 MERGED_CLOUD = "points"
 MERGED_CAMERAS = "points/cameras"
+OBSTACLES, GROUND, SCAN = "obstacles", "ground", "scan"
 DEPTH, DEPTH_INFO = "depth/image_rect", "depth/camera_info"
 CONFIDENCE = "depth/confidence"
 ODOMETRY = "odometry"
@@ -33,6 +40,26 @@ _CAMERA_TYPES = {
     PICTURE_INFO: CAMERA_INFO_TYPE,
     CLOUD: POINT_CLOUD_TYPE,
 }
+_MERGED_TYPES = {
+    MERGED_CLOUD: POINT_CLOUD_TYPE,
+    MERGED_CAMERAS: STRING_TYPE,
+    OBSTACLES: POINT_CLOUD_TYPE,
+    GROUND: POINT_CLOUD_TYPE,
+    SCAN: SCAN_TYPE,
+}
+
+
+class OutputLimits(NamedTuple):
+    """Which points clouds keep, and what an obstacle and a scan are."""
+
+    cloud: CloudLimits = CloudLimits()
+    obstacles: ObstacleLimits = ObstacleLimits()
+    scan: ScanLimits = ScanLimits()
+
+    @classmethod
+    def of(cls, settings: OutputSettings) -> "OutputLimits":
+        """Return those of the settings."""
+        return cls(settings.cloud_limits, settings.obstacle_limits, settings.scan_limits)
 
 
 class OutputMessage(NamedTuple):
@@ -49,7 +76,7 @@ def output_types(cameras: Sequence[str], has_odometry: bool = False) -> dict[str
     """Return every output topic, below the node's name, with its message type."""
     odometry = {ODOMETRY: ODOMETRY_TYPE} if has_odometry else {}
     per_camera = {f"{camera}/{part}": type_ for camera in cameras for part, type_ in _CAMERA_TYPES.items()}
-    return {**per_camera, MERGED_CLOUD: POINT_CLOUD_TYPE, MERGED_CAMERAS: STRING_TYPE, **odometry}
+    return {**per_camera, **_MERGED_TYPES, **odometry}
 
 
 def camera_topics(camera: str) -> list[str]:
@@ -57,23 +84,55 @@ def camera_topics(camera: str) -> list[str]:
 
     What a merged cloud contains is known when it could be made.
     """
-    return [*(f"{camera}/{part}" for part in _CAMERA_TYPES), MERGED_CLOUD, MERGED_CAMERAS, ODOMETRY]
+    return [*(f"{camera}/{part}" for part in _CAMERA_TYPES), *_MERGED_TYPES, ODOMETRY]
+
+
+class MergedProducts:
+    """What is made of all cameras of a set together; each part is made once, when it is asked for."""
+
+    def __init__(self, result: SurroundDepth, rig: Rig, limits: OutputLimits) -> None:
+        self._result, self._rig, self._limits = result, rig, limits
+
+    @cached_property
+    def points(self) -> Cloud:
+        """The merged cloud [M, 4] inside its limits, base frame."""
+        limits = self._limits.cloud
+        inside = banded(self._whole, limits)
+        return thinned(inside, limits.voxel) if limits.voxel else inside
+
+    @cached_property
+    def separated(self) -> SeparatedCloud:
+        """Ground and obstacles."""
+        return separate(self._whole, self._rig.ground_z, self._limits.obstacles)
+
+    @cached_property
+    def _whole(self) -> Cloud:
+        return merged_cloud(self._result, self._rig, self._limits.cloud.whole)
 
 
 class SurroundMessages:
     """Builds the messages of surround sets, with the message classes of one library."""
 
-    def __init__(self, factory: MessageFactory, depth_encoding: str, depth_min_confidence: float = 0.0) -> None:
-        """Depth images are unknown where confidence is below `depth_min_confidence`."""
+    def __init__(
+        self,
+        factory: MessageFactory,
+        depth_encoding: str,
+        depth_min_confidence: float = 0.0,
+        sky: SkyChoice = "keep",
+    ) -> None:
+        """Depth images are unknown where confidence is below `depth_min_confidence`; for `sky` see `shown_depth`."""
         self._factory = factory
+        self._sky: SkyChoice = sky
         self._encoding = depth_encoding
         self._least = depth_min_confidence
+        self.ground: GroundPlane | None = None
+        """Where the ground was in the last set whose obstacles were asked for; None before any."""
 
     def of_set(
         self,
         estimated: EstimatedSet[Any],
         frame_ids: Mapping[str, str],
-        limits: CloudLimits,
+        limits: OutputLimits,
         wanted: Callable[[str], object],
     ) -> Iterator[OutputMessage]:
         """Build, one after the other, the messages of the topics that are `wanted`, for the cameras that are there.
@@ -85,7 +144,7 @@ class SurroundMessages:
         for index, camera in enumerate(rig.names):
             if result.present[index]:
                 stamp = surround_set.stamps_ns[camera]
-                builders = self._camera_messages(result, index, stamp, frame_ids[camera], limits.min_confidence)
+                builders = self._camera_messages(result, index, stamp, frame_ids[camera], limits.cloud.min_confidence)
                 for part, build in builders.items():
                     if wanted(f"{camera}/{part}"):
                         yield OutputMessage(f"{camera}/{part}", camera, build())
@@ -95,6 +154,10 @@ class SurroundMessages:
         if estimated.visual is not None and wanted(ODOMETRY):
             yield OutputMessage(ODOMETRY, surround_set.anchor, self._odometry(estimated.visual, rig.base_frame))
 
+    def _depth_image(self, stamp: int, frame_id: str, result: SurroundDepth, index: int) -> Any:
+        depth = result.shown_depth(index, self._sky, self._least)
+        return self._factory.depth_image(stamp, frame_id, depth, self._encoding)
+
     def _odometry(self, visual: VisualMotion, base_frame: str) -> Any:
         """Return the motion that the pictures tell; its world is another one after every gap."""
         errors = Covariances(visual.covariance, visual.aligned.covariance)
@@ -103,15 +166,26 @@ class SurroundMessages:
         )
 
     def _merged_messages(
-        self, stamp: int, result: SurroundDepth, rig: Rig, limits: CloudLimits
+        self, stamp: int, result: SurroundDepth, rig: Rig, limits: OutputLimits
     ) -> dict[str, Callable[[], Any]]:
         """Return how to build each of the messages about all cameras together."""
         contained = [name for name, present in zip(rig.names, result.present, strict=True) if present]
         description = {"stamp": stamp, "frame_id": rig.base_frame, "cameras": contained}
+        make, frame, merged = self._factory, rig.base_frame, MergedProducts(result, rig, limits)
         return {
-            MERGED_CLOUD: lambda: self._factory.point_cloud(stamp, rig.base_frame, merged_cloud(result, rig, limits)),
-            MERGED_CAMERAS: lambda: self._factory.string(json.dumps(description)),
+            MERGED_CLOUD: lambda: make.point_cloud(stamp, frame, merged.points),
+            MERGED_CAMERAS: lambda: make.string(json.dumps(description)),
+            OBSTACLES: lambda: make.point_cloud(stamp, frame, self._separated(merged).obstacles),
+            GROUND: lambda: make.point_cloud(stamp, frame, self._separated(merged).ground),
+            SCAN: lambda: make.laser_scan(stamp, frame, self._scan(merged, limits)),
         }
+
+    def _separated(self, merged: MergedProducts) -> SeparatedCloud:
+        self.ground = merged.separated.plane
+        return merged.separated
+
+    def _scan(self, merged: MergedProducts, limits: OutputLimits) -> Scan:
+        return scan_of(self._separated(merged), limits.scan, limits.obstacles.max_range)
 
     def _camera_messages(
         self, result: SurroundDepth, index: int, stamp: int, frame_id: str, least: float
@@ -120,7 +194,7 @@ class SurroundMessages:
         make, intrinsics, picture = self._factory, result.intrinsics[index], result.pictures[index]
         size, confidence = result.depth[index].shape, result.confidence
         builders: dict[str, Callable[[], Any]] = {
-            DEPTH: lambda: make.depth_image(stamp, frame_id, result.sure_depth(index, self._least), self._encoding),
+            DEPTH: lambda: self._depth_image(stamp, frame_id, result, index),
             DEPTH_INFO: lambda: make.camera_info(stamp, frame_id, intrinsics, *size),
             PICTURE: lambda: make.colour_image(stamp, frame_id, picture),
             PICTURE_INFO: lambda: make.camera_info(stamp, frame_id, intrinsics, *size),

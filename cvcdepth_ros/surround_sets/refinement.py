@@ -51,9 +51,14 @@ class RefinementStage:
         wants_confidence: Callable[[], bool] = lambda: False,
         latencies: StageLatencies | None = None,
         follows_always: bool = False,
+        knows_motion: Callable[[], bool] = lambda: False,
     ) -> None:
-        """`wants_confidence` is asked for every set where depth is not refined; `follows_always`: for odometry."""
-        self._refines = settings.refine == "geometry"
+        """`wants_confidence` is asked for every set where depth is not refined; `follows_always`: for odometry.
+
+        `knows_motion` is asked where `refine` is auto: whether anything tells how the vehicle moves.
+        """
+        self._refine = settings.refine
+        self._knows_motion = knows_motion
         self._grid = RefinementSettings(max_grid_width=settings.refine_width)
         self._poses_at = poses_at
         self._wants_confidence = wants_confidence
@@ -70,6 +75,15 @@ class RefinementStage:
     def is_active(self) -> bool:
         """Whether the next set's pictures are compared; all cameras are needed then."""
         return self._refines or self._follows_always or self._wants_confidence()
+
+    @property
+    def needs_motion(self) -> bool:
+        """Whether the vehicle's motion is of use, where there is any."""
+        return self._refine != "off" or self.is_active
+
+    @property
+    def _refines(self) -> bool:
+        return self._refine == "geometry" or (self._refine == "auto" and self._knows_motion())
 
     def summary(self) -> dict[str, Any] | None:
         """Return for how many sets motion was taken from where, with JSON's types; None where nothing was done."""

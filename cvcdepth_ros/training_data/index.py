@@ -58,6 +58,8 @@ class RecordingIndex:
     """Where the motion is recorded."""
     unread: tuple[str, ...] = ()
     """Descriptions of messages and sets that could not be read or used."""
+    motion_problem: str = ""
+    """Why recorded motion is not used, though there is some."""
 
     @property
     def times(self) -> NDArray[np.int64]:
@@ -87,18 +89,19 @@ def load_index(
     rig_layout: RigLayout | None = None,
     base_frame: str = "base_link",
     scale_from: ScaleSource = "overlaps",
+    with_motion: bool = True,
 ) -> RecordingIndex:
     """Return the index of the recording at `path`, from `directory` when a current one is there, else built and kept.
 
     `rig_layout` names cameras and what the recording lacks; without it the cameras are found, and `base_frame` is the
-    vehicle's. Raises RecordingError, RigError or TransformError, naming the recording, when it has no sets, no complete
-    rig, or nothing to learn the scale from.
+    vehicle's; `with_motion` False takes it for one without recorded motion. Raises RecordingError, RigError or
+    TransformError, naming the recording, when it has no sets, no complete rig, or nothing to learn the scale from.
     """
     kept = KeptResults(directory, _to_arrays, partial(_from_arrays, path))
     return kept.load_or_make(
         str(path),
-        _work(path, matching, rig_layout, base_frame),
-        lambda: build_index(path, matching, rig_layout, base_frame, scale_from),
+        {**_work(path, matching, rig_layout, base_frame), **({} if with_motion else {"motion": "not used"})},
+        lambda: build_index(path, matching, rig_layout, base_frame, scale_from, with_motion),
     )
 
 
@@ -108,6 +111,7 @@ def build_index(
     rig_layout: RigLayout | None = None,
     base_frame: str = "base_link",
     scale_from: ScaleSource = "overlaps",
+    with_motion: bool = True,
 ) -> RecordingIndex:
     """Return the index of the recording at `path`, read anew; see `load_index`."""
     with open_recording(path) as recording:
@@ -116,20 +120,23 @@ def build_index(
             recorded = RecordedRig.from_recording(recording, base_frame=base_frame)
         else:
             recorded = RecordedRig.from_recording(recording, rig_layout).completed()
-        return index_recording(recorded, matching, scale_from)
+        return index_recording(recorded, matching, scale_from, with_motion)
 
 
 def index_recording(
-    recorded: RecordedRig, matching: MatchingSettings, scale_from: ScaleSource = "overlaps"
+    recorded: RecordedRig,
+    matching: MatchingSettings,
+    scale_from: ScaleSource = "overlaps",
+    with_motion: bool = True,
 ) -> RecordingIndex:
-    """Return the index of a rig's recording, which is read through; see `load_index` for the errors."""
+    """Return the index of a rig's recording, which is read through; see `load_index`."""
     path, layout = recorded.recording.path, recorded.layout
     truth = RecordedTruth(recorded, lidar=())
-    motion = truth.motion
+    motion = truth.motion if with_motion else None
     if scale_from == "overlaps" or (scale_from == "overlaps or motion" and motion is None):
         _refuse_lonely_cameras(recorded)
     replay = SurroundReplay(recorded, matching)
-    sets, thumbnails = _collect(replay, truth)
+    sets, thumbnails = _collect(replay, None if motion is None else truth)
     for change in replay.calibration_changes[:1]:
         raise RigError(f"{path}: {change}; take the parts before and after as two recordings")
     if not sets:
@@ -198,11 +205,13 @@ def _refuse_blind_cameras(recording: Recording) -> None:
         )
 
 
-def _collect(replay: SurroundReplay, truth: RecordedTruth) -> tuple[list[SurroundSet[int]], list[NDArray[np.uint8]]]:
-    """Return the sets with the images' log times, and thumbnails when there is no motion for `truth` to read along."""
+def _collect(
+    replay: SurroundReplay, truth: RecordedTruth | None
+) -> tuple[list[SurroundSet[int]], list[NDArray[np.uint8]]]:
+    """Return the sets with the images' log times, and thumbnails where there is no `truth` to read motion along."""
     sets, thumbnails = [], []
-    for found in replay.sets(handlers=truth.handlers):
-        if truth.motion is None:
+    for found in replay.sets(handlers=None if truth is None else truth.handlers):
+        if truth is None:
             anchor = replay.layout.anchor_camera
             thumbnail = thumbnail_of(found.images[anchor].message, anchor)
             if thumbnail is None:

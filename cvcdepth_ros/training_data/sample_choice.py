@@ -41,7 +41,9 @@ def describe_motion(index: RecordingIndex, config: RecordingsConfig) -> str:
     """Return where the losses' motion of a recording comes from, in words."""
     if takes_recorded_motion(index, config):
         return f"recorded ({index.motion_topic})"
-    return "pose network" if config.motion == "network" else "pose network, for none is recorded"
+    if config.motion == "network":
+        return "pose network"
+    return f"pose network, for {index.motion_problem or 'none is recorded'}"
 
 
 def takes_recorded_exposures(index: RecordingIndex, config: RecordingsConfig) -> bool:

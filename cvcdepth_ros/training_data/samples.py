@@ -61,7 +61,7 @@ class NetworkRig:
             tuple(rig.names),
             index.anchor,
             np.stack([camera.base_T_camera for camera in rig.cameras]),
-            rig.ground_height,
+            rig.ground_z,
             tuple(rig.neighbour_indices),
         )
 

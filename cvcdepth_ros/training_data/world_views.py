@@ -67,7 +67,7 @@ class ViewReader:
         self.height, self.width = height, width
         self._shards = [Shard(path) for path in paths]
         self._cameras = [shard.layout.complete().cameras for shard in self._shards]
-        self._ground_heights = [shard.layout.ground_height for shard in self._shards]
+        self._ground_heights = [shard.layout.ground_z for shard in self._shards]
         self.views = [
             View(i, number, camera)
             for i, shard in enumerate(self._shards)

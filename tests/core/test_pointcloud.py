@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from recordings import SAMPLE
 
-from cvcdepth_core.pointcloud import CloudLimits, merged_cloud, organised_cloud, pack_rgb, thinned
+from cvcdepth_core.pointcloud import CloudLimits, merged_cloud, on_edges, organised_cloud, pack_rgb, thinned
 from cvcdepth_core.surround_depth import SurroundDepth
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.bench.baseline_cloud import baseline_cloud
@@ -117,3 +117,44 @@ def test_pixels_that_are_not_sure_enough_make_no_points(surround, rig):
 
 def test_where_nothing_is_known_of_confidence_nothing_is_sure(surround, rig):
     assert len(merged_cloud(surround, rig, CloudLimits(min_confidence=0.1))) == 0
+
+
+def test_the_sky_makes_no_points(surround, rig):
+    sky = np.random.default_rng(2).random(surround.depth.shape) < 0.3
+    clear = replace(surround, sky=sky)
+    assert len(merged_cloud(clear, rig, CloudLimits())) == (~sky & ~np.isnan(surround.depth)).sum()
+    np.testing.assert_array_equal(np.isnan(organised_cloud(clear, 2)[..., 0]), sky[2] | np.isnan(surround.depth[2]))
+
+
+def test_only_heights_inside_the_band_stay(surround, rig):
+    whole = merged_cloud(surround, rig, CloudLimits())
+    band = merged_cloud(surround, rig, CloudLimits(min_height=-1.0, max_height=2.5))
+    np.testing.assert_array_equal(band, whole[(whole[:, 2] >= -1.0) & (whole[:, 2] <= 2.5)])
+
+
+def test_pixels_between_a_post_and_the_wall_behind_it_are_edges_and_slanted_surfaces_are_none():
+    focal, rows = 160.0, np.arange(100) - 20.0
+    ground = np.where(rows > 4, 1.5 * focal / np.maximum(rows, 1), np.nan)[:, None].repeat(60, 1).astype(np.float32)
+    assert not on_edges(ground, focal, 0.3).any()
+    columns = np.arange(60) - 30.0
+    wall = np.broadcast_to(
+        (4.0 / (1 + 1.5 * columns / focal)).astype(np.float32), (100, 60)
+    )  # passes far from the camera
+    assert not on_edges(wall, focal, 0.3).any()
+    depth = np.full((100, 60), 12.0, np.float32)
+    depth[:, 20:30] = 4.0
+    depth[:, 30:33] = (5.5, 7.5, 10.0)  # as networks join two surfaces
+    edges = on_edges(depth, focal, 0.3)
+    assert edges[:, 29:33].all()
+    assert not edges[:, 21:29].any()
+    assert not edges[:, 34:].any()
+
+
+def test_edges_make_no_points_whatever_the_stride(surround, rig):
+    depth = np.full(surround.depth.shape, 12.0, np.float32)
+    depth[:, :, :75] = 3.0
+    steps = replace(surround, depth=depth)
+    for stride, left in ((1, 148), (3, 48)):
+        cloud = merged_cloud(steps, rig, CloudLimits(stride, edge_clearance=0.3))
+        assert len(cloud) == 6 * left * len(range(0, HEIGHT, stride))
+    assert len(merged_cloud(steps, rig, CloudLimits())) == depth.size

@@ -156,14 +156,55 @@ def test_the_terms_of_the_overlap_are_lower_at_the_true_mounts(axis: int, degree
     assert found["temporal"] == pytest.approx(at_truth()["temporal"])  # looks at no other camera
 
 
-def test_the_gradient_leads_back_from_a_wrong_scale():
-    for scale in (0.9, 1.1):
-        factor = torch.tensor(scale, dtype=torch.float64, requires_grad=True)
-        depth = true_depth() * factor
-        value = evaluate_objective(batch(), Prediction(1 / depth, depth, true_motions()), OBJECTIVE)
-        value.loss.backward()
-        assert factor.grad is not None
-        assert float(factor.grad) * (scale - 1) > 0
+@cache
+def slopes(what: str, share: float) -> dict[str, float]:
+    """By how much each term grows with the scale of all depth, of one camera's, or of the way, where that is wrong."""
+    factor = torch.tensor(share, dtype=torch.float64, requires_grad=True)
+    depth, motions = true_depth(), true_motions()
+    if what == "way":
+        way = torch.cat([factor.expand(3), torch.ones(1)])[:, None] * motions[..., 3:]
+        motions = torch.cat([motions[..., :3], way], dim=-1)
+    elif what == "one camera":
+        depth = torch.cat([depth[:, :1] * factor, depth[:, 1:]], dim=1)
+    else:
+        depth = depth * factor
+    noise = torch.zeros(1, 2, depth.shape[1], 1, HEIGHT, WIDTH, dtype=torch.float64)
+    value = evaluate_objective(batch(), Prediction(1 / depth, depth, motions), OBJECTIVE, noise)
+    every = {name: term.mean() for name, term in value.terms.items()} | {"loss": value.loss}
+    return {
+        name: float(torch.autograd.grad(term, factor, retain_graph=True)[0])
+        for name, term in every.items()
+        if term.requires_grad
+    }
+
+
+LED_BY = {
+    "scale": ("loss", *PHOTOMETRIC),
+    "one camera": ("loss", "temporal", "spatial", "spatio_temporal", "depth_consistency"),
+    "way": ("loss", "temporal", "spatio_temporal"),
+}
+
+
+@pytest.mark.parametrize("share", [0.9, 1.1])
+@pytest.mark.parametrize(("what", "name"), [(what, name) for what, names in LED_BY.items() for name in names])
+def test_the_gradient_of_the_loss_and_of_each_term_leads_back_from_what_is_wrong(what: str, name: str, share: float):
+    assert slopes(what, share)[name] * (share - 1) > 0
+
+
+@cache
+def untold() -> RigBatch:
+    """The same sample when nobody tells that the cameras fired one after another, as in the published method."""
+    at_once = CONFIG.recordings.model_copy(update={"exposure_motion": "none"})
+    (sample,) = RecordingBatches([index()], CONFIG.model_copy(update={"recordings": at_once})).epoch(0)
+    assert sample is not None
+    return sample.to(dtype=torch.float64)
+
+
+@pytest.mark.parametrize("name", ["spatial", "spatio_temporal"])
+def test_cameras_that_fire_in_turn_agree_only_where_their_exposures_are_told(name: str):
+    spread = np.ptp(index().times[1]) / 1e9
+    assert spread > 0.04
+    assert terms(true_depth(), true_motions(), untold())[name] > 1.03 * at_truth()[name]
 
 
 def test_the_recording_goes_through_check_and_evaluate(tmp_path, capsys: pytest.CaptureFixture[str]):

@@ -494,7 +494,7 @@ def test_every_recording_is_checked_and_one_that_cannot_be_read_is_named(tmp_pat
     out, err = capsys.readouterr()
     bad, good = json.loads(out)["recordings"]
     assert "begins with" in bad["unreadable"]
-    assert good["counts"] == {"passed": 12, "skipped": 4, "warning": 1}
+    assert good["counts"] == {"passed": 13, "skipped": 4, "warning": 1}
     assert "bad.mcap" in err
     assert "good.mcap" not in err
 

@@ -136,6 +136,23 @@ def test_pictures_and_truth_are_those_of_the_drive_at_their_stamps(recorded: Pat
             assert ((moving[number].data.reshape(40, 64) > 0) == shot.truth.moving).all()
 
 
+def test_normals_and_flow_are_recorded_as_pixels_of_the_picture(recorded: Path, drive: SimulatedDrive):
+    for index, camera in enumerate(drive.rig.cameras):
+        normals, flows = (messages(recorded, truth_topic(camera.name, what)) for what in ("normals", "flow"))
+        assert (normals[0].encoding, flows[0].encoding) == ("32FC3", "32FC2")
+        first, second = (drive.shoot(index, number).truth for number in (0, 1))
+        assert (normals[0].data.view("<f4").reshape(40, 64, 3) == first.normals).all()
+        moved = flows[0].data.view("<f4").reshape(40, 64, 2)
+        assert (np.isnan(moved[..., 0]) >= np.isinf(first.depth)).all()
+        # What moves by so many pixels is seen there in the next picture, but for what is hidden by then.
+        rows, columns = np.nonzero(np.isfinite(moved[..., 0]))
+        x, y = np.rint(moved[rows, columns] + np.stack([columns, rows], axis=1)).astype(int).T
+        inside = (x >= 0) & (x < 64) & (y >= 0) & (y < 40)
+        assert inside.mean() > 0.7
+        again = second.objects[y[inside], x[inside]] == first.objects[rows[inside], columns[inside]]
+        assert again.mean() > 0.9
+
+
 def test_cameras_fire_when_the_lidar_looks_where_they_look():
     front, left = SPEC.layout.complete().cameras
     assert SPEC.camera_time(front, 1) == SPEC.set_time(1)

@@ -9,17 +9,17 @@ from recordings import SAMPLE
 
 from cvcdepth_core.estimator import DepthEstimator, SurroundDepthEstimator
 from cvcdepth_core.networks import DepthModelSpec
-from cvcdepth_core.pointcloud import CloudLimits
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.messages.conversion import bag_message_factory
 from cvcdepth_ros.recordings.replay import DepthReplay, SurroundReplay
 from cvcdepth_ros.recordings.rig import RecordedRig
 from cvcdepth_ros.settings import MatchingSettings, ModelSettings
-from cvcdepth_ros.surround_sets.output_messages import SurroundMessages
+from cvcdepth_ros.surround_sets.output_messages import OutputLimits, SurroundMessages
 from cvcdepth_ros.surround_sets.refinement import RefinementStage
 
 GEOMETRY = ModelSettings.model_validate({"refine": "geometry"})
 OFF = ModelSettings.model_validate({"refine": "off"})
+AUTO = ModelSettings.model_validate({"refine": "auto"})
 
 
 @pytest.fixture(scope="module")
@@ -43,6 +43,19 @@ def test_switched_off_it_gives_what_it_is_given(drive):
     assert not stage.is_active
     assert [one.result for one in finished(stage, surround, sets)] == [one.result for one in sets]
     assert stage.summary() is None
+
+
+def test_auto_refines_from_when_on_something_tells_the_motion(drive):
+    surround, sets = drive
+    motion = [False, True, True]
+    stage = RefinementStage(AUTO, knows_motion=lambda: motion[0])
+    assert stage.needs_motion
+    for before in sets:
+        is_known = motion[0]
+        (after,) = finished(stage, surround, [before])
+        assert (after.result.depth is before.result.depth) is not is_known
+        motion.pop(0)
+        motion.append(True)
 
 
 def test_confidence_alone_leaves_depth_as_it_is(drive):
@@ -92,7 +105,7 @@ def test_depth_that_is_not_sure_enough_is_left_out_of_images_and_not_of_what_is_
     messages = SurroundMessages(bag_message_factory(), "32FC1", depth_min_confidence=0.5)
     frames = dict.fromkeys(surround.rig.names, "frame")
     wanted = {"left/depth/image_rect", "left/depth/confidence"}
-    built = {m.topic: m.message for m in messages.of_set(found, frames, CloudLimits(), wanted.__contains__)}
+    built = {m.topic: m.message for m in messages.of_set(found, frames, OutputLimits(), wanted.__contains__)}
     assert built.keys() == wanted
     images = {topic: m.data.view(np.float32).reshape(m.height, m.width) for topic, m in built.items()}
     sure = images["left/depth/confidence"] >= 0.5
