@@ -48,7 +48,7 @@ class CrossViewDepthNet(DepthNetwork):
     """SurroundDepth: every camera's features look at those of all cameras, at all five levels of the encoder."""
 
     independent: ClassVar[bool] = False
-    engines: ClassVar[tuple[str, ...]] = ("torch_eager",)
+    engines: ClassVar[tuple[str, ...]] = ("torch_eager", "onnxruntime")
 
     def __init__(self, encoder: str, cross_view: CrossViewSpec) -> None:
         super().__init__()
@@ -248,6 +248,9 @@ def _names_of_level(level: int) -> dict[str, str]:
             names[f"{theirs}decoder.{block}.{name}"] = f"{ours}blocks.{block}.{within[name]}"
     return names
 
+
+ENCODER_NAMES = {"encoder.": "depth_encoder.encoder."}
+"""How the names of parameters begin in the released encoder.pth, and in ours."""
 
 DECODER_NAMES = {
     "decoder.": "depth_decoder.decoder.",

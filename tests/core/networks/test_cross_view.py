@@ -5,9 +5,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from cvcdepth_core.networks import DepthModelSpec, RigImages, build_depth_network
-from cvcdepth_core.networks.checkpoint import load_checkpoint, save_checkpoint
-from cvcdepth_core.networks.cross_view import CrossViewDepthNet, CrossViewSpec, CrossViewTransformer
+from cvcdepth_core.errors import CheckpointError
+from cvcdepth_core.networks import DepthModelSpec, PoseNet, RigImages, build_depth_network
+from cvcdepth_core.networks.checkpoint import import_released, load_checkpoint, save_checkpoint
+from cvcdepth_core.networks.cross_view import (
+    DECODER_NAMES,
+    ENCODER_NAMES,
+    CrossViewDepthNet,
+    CrossViewSpec,
+    CrossViewTransformer,
+)
+from cvcdepth_core.networks.vfdepth import renamed
 
 HEIGHT, WIDTH = 64, 96
 SPEC = DepthModelSpec(
@@ -18,6 +26,15 @@ SPEC = DepthModelSpec(
     min_depth=0.5,
     max_depth=50,
     cross_view=CrossViewSpec(blocks=2),
+)
+
+RELEASED = DepthModelSpec(
+    network="surrounddepth",
+    height=HEIGHT,
+    width=WIDTH,
+    min_depth=0.5,
+    max_depth=50,
+    cross_view=CrossViewSpec(blocks=1, scales=4, released_layout=True),
 )
 
 
@@ -109,3 +126,46 @@ def test_transformers_are_the_usual_ones_where_none_are_given_and_refused_for_ot
     assert DepthModelSpec(network="surrounddepth", **sizes).cross_view == CrossViewSpec()
     with pytest.raises(ValueError, match="cross_view is given, but the network per_camera has none"):
         DepthModelSpec(cross_view=CrossViewSpec(), **sizes)
+
+
+@pytest.fixture
+def released(tmp_path):
+    """Four files as SurroundDepth's authors release them, with random weights, and the networks that they come from."""
+    torch.manual_seed(5)
+    depth, pose = build_depth_network(RELEASED), PoseNet(RELEASED.encoder)
+    theirs = renamed(depth.state_dict(), {ours: name for name, ours in (DECODER_NAMES | ENCODER_NAMES).items()})
+    encoder = {key: value for key, value in theirs.items() if key.startswith("encoder.")}
+    classifier = {"encoder.fc.weight": torch.zeros(1000, 512), "encoder.fc.bias": torch.zeros(1000)}
+    torch.save(encoder | classifier | {"height": 64, "width": 96, "use_stereo": False}, tmp_path / "encoder.pth")
+    torch.save({key: value for key, value in theirs.items() if key not in encoder}, tmp_path / "depth.pth")
+    motions = {key: value for key, value in pose.state_dict().items() if key.startswith("pose_decoder.")}
+    motions = renamed(motions, {"pose_decoder.": ""})
+    for key in ("net.3.weight", "net.3.bias"):
+        motions[key] = torch.cat([motions[key], torch.ones_like(motions[key])])
+    torch.save(motions, tmp_path / "pose.pth")
+    of_encoder = renamed(pose.pose_encoder.state_dict(), {"encoder.": "encoder."})
+    torch.save(of_encoder | classifier, tmp_path / "pose_encoder.pth")
+    return tmp_path, depth, pose
+
+
+def test_released_weights_are_imported_without_the_parts_that_are_never_used(released):
+    directory, depth, pose = released
+    imported = import_released(directory, RELEASED)
+    for found, network in ((imported.depth_net, depth), (imported.pose_net, pose)):
+        assert found.keys() == network.state_dict().keys()
+        assert all(torch.equal(found[key], value) for key, value in network.state_dict().items())
+
+
+@pytest.mark.parametrize(
+    ("part", "change", "message"),
+    [
+        ("depth", {"decoder.99.bias": torch.zeros(1)}, r"unexpected depth_decoder.decoder.99.bias"),
+        ("pose", {"net.0.bias": torch.zeros(3)}, r"pose.pth: .*misshapen pose_decoder.net.0.bias is \[3\]"),
+        ("encoder", {"note": "hello"}, "encoder.pth: holds a dict, expected a plain dictionary of tensors"),
+    ],
+)
+def test_released_weights_that_do_not_fit_are_refused_by_name(released, part, change, message):
+    path = released[0] / f"{part}.pth"
+    torch.save(torch.load(path) | change, path)
+    with pytest.raises(CheckpointError, match=message):
+        import_released(released[0], RELEASED)
