@@ -93,7 +93,10 @@ class DepthModelSpec(BaseModel):
     def _part_of_the_network_is_the_usual_one(cls, fields: Any) -> Any:
         if not isinstance(fields, dict):
             return fields
-        usual = {VFDEPTH: {"volume": VolumeSpec()}, SURROUNDDEPTH: {"cross_view": CrossViewSpec()}}
+        usual: dict[str, dict[str, BaseModel]] = {
+            VFDEPTH: {"volume": VolumeSpec()},
+            SURROUNDDEPTH: {"cross_view": CrossViewSpec()},
+        }
         missing = usual.get(str(fields.get("network")), {})
         return fields | {name: part for name, part in missing.items() if fields.get(name) is None}
 
