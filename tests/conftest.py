@@ -31,6 +31,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         default=Path(__file__).parent / "whole" / "golden_vfdepth",
         help="the same for test_golden_vfdepth.py",
     )
+    parser.addoption(
+        "--golden-surrounddepth-dir",
+        type=Path,
+        default=Path(__file__).parent / "whole" / "golden_surrounddepth",
+        help="the same for test_golden_surrounddepth.py",
+    )
     parser.addoption("--all-faults", action="store_true", help="inject all faults into the node, not only every fifth")
     parser.addoption("--fault-table", type=Path, help="where the tests of faults write what they measured")
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import pickle
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,8 +22,10 @@ from torch import Tensor, nn
 
 from cvcdepth_core.errors import CheckpointError, validation_messages
 from cvcdepth_core.files import write_atomically
+from cvcdepth_core.networks.cross_view import DECODER_NAMES, ENCODER_NAMES
 from cvcdepth_core.networks.encoders import Encoder
-from cvcdepth_core.networks.registry import RELEASED_NAMES, DepthModelSpec, build_depth_network
+from cvcdepth_core.networks.pose import PoseNet
+from cvcdepth_core.networks.registry import RELEASED_NAMES, SURROUNDDEPTH, DepthModelSpec, build_depth_network
 from cvcdepth_core.networks.rig_images import DepthNetwork
 from cvcdepth_core.networks.vfdepth import VolumePoseNet, renamed
 
@@ -32,6 +34,7 @@ FORMAT_VERSION = "1"
 _VERSION_KEY, _SPEC_KEY = "cvcdepth_format_version", "cvcdepth_spec"
 _DEPTH_PREFIX, _POSE_PREFIX, _RELEASED_PREFIX = "depth_net.", "pose_net.", "module."
 _NAMED_KEYS = 3
+_MOTION = 6  # numbers of one
 
 State = Mapping[str, Tensor]
 
@@ -105,11 +108,15 @@ def load_spec(path: str | Path) -> DepthModelSpec:
 
 
 def import_released(directory: str | Path, spec: DepthModelSpec) -> Checkpoint:
-    """Read the authors' `weights_<n>/{depth_net,pose_net}.pth` (method section 10), or those of VFDepth's authors.
+    """Read the authors' `weights_<n>/{depth_net,pose_net}.pth` (method section 10), or those of other systems' authors.
+
+    VFDepth's have the same names of files, SurroundDepth's are `{encoder,depth,pose_encoder,pose}.pth`.
 
     `spec` says what they were trained for, and so whose they are. Raises CheckpointError naming the file when one is
     missing, damaged, holds more than tensors, or does not fit `spec`.
     """
+    if spec.network == SURROUNDDEPTH:
+        return _import_surrounddepth(Path(directory), spec)
     files = [Path(directory) / "depth_net.pth", Path(directory) / "pose_net.pth"]
     digest = _sha256(files)
     names = RELEASED_NAMES.get(spec.network, ({}, {}))
@@ -121,6 +128,33 @@ def import_released(directory: str | Path, spec: DepthModelSpec) -> Checkpoint:
             VolumePoseNet(spec.encoder, spec.volume), pose_net, f"{files[1]}: pose network ({spec.kind})"
         )
     return checkpoint
+
+
+def _import_surrounddepth(directory: Path, spec: DepthModelSpec) -> Checkpoint:
+    """Read SurroundDepth's four files, but for what its networks never use.
+
+    That is the encoders' classifier (`fc`) and the second of two motions that the last layer of the pose network tells.
+    """
+    files = [directory / f"{name}.pth" for name in ("encoder", "depth", "pose_encoder", "pose")]
+    digest = _sha256(files)
+    encoder, decoder, pose_encoder, pose = map(_state_beside_numbers, files)
+    depth_net = renamed(encoder, ENCODER_NAMES) | renamed(decoder, DECODER_NAMES)
+    pose_net = renamed(pose_encoder, {"encoder.": "pose_encoder.encoder."}) | renamed(
+        pose, {"net.": "pose_decoder.net."}
+    )
+    for key in ("pose_decoder.net.3.weight", "pose_decoder.net.3.bias"):
+        if key in pose_net:
+            pose_net[key] = pose_net[key][:_MOTION]
+    checkpoint = Checkpoint(directory, spec, depth_net, pose_net, digest)
+    checkpoint.build_depth_net()
+    load_network_state(PoseNet(spec.encoder), pose_net, f"{files[2]} and pose.pth: pose network ({spec.kind})")
+    return checkpoint
+
+
+def _state_beside_numbers(file: Path) -> dict[str, Tensor]:
+    """Return a file's tensors without those of a classifier; numbers of what it was trained for stand beside them."""
+    tensors = _read_tensors_of_pickle(file, beside=("height", "width", "use_stereo"))
+    return {key: value for key, value in _without_prefix("", tensors).items() if not key.startswith("encoder.fc.")}
 
 
 def _released_state(file: Path) -> dict[str, Tensor]:
@@ -214,15 +248,17 @@ def _why_unreadable(path: Path) -> str:
     return "is damaged or not a safetensors file"
 
 
-def _read_tensors_of_pickle(path: Path) -> dict[str, Tensor]:
+def _read_tensors_of_pickle(path: Path, beside: Collection[str] = ()) -> dict[str, Tensor]:
+    """Return the tensors of a file, which may have numbers of the names `beside` as well."""
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise CheckpointError(f"{path}: is damaged or holds more than tensors: {reason}") from error
-    if not isinstance(state, Mapping) or not all(isinstance(value, Tensor) for value in state.values()):
+    tensors = {key: value for key, value in state.items() if key not in beside} if isinstance(state, Mapping) else {}
+    if not tensors or not all(isinstance(value, Tensor) for value in tensors.values()):
         raise CheckpointError(f"{path}: holds a {type(state).__name__}, expected a plain dictionary of tensors")
-    return dict(state)
+    return tensors
 
 
 def _take_spec(path: Path, header: dict[str, str]) -> DepthModelSpec:

@@ -18,6 +18,7 @@ from pydantic import (
 )
 
 from cvcdepth_core.model_choices import ENCODERS
+from cvcdepth_core.networks.cross_view import CrossViewDepthNet, CrossViewSpec
 from cvcdepth_core.networks.depth import INPUT_STRIDE, MIN_INPUT_SIZE, DepthNet
 from cvcdepth_core.networks.rig_conditioned import RigConditionedNet
 from cvcdepth_core.networks.rig_images import DepthNetwork
@@ -30,6 +31,8 @@ RIG_CONDITIONED = "rig_conditioned"
 """The network that is told its rig: see `RigConditionedNet`."""
 VFDEPTH = "vfdepth"
 """The network that fuses its cameras in a volume: see `FusedDepthNet`."""
+SURROUNDDEPTH = "surrounddepth"
+"""The network whose cameras look at each other's features: see `CrossViewDepthNet`."""
 
 
 class DepthModelSpec(BaseModel):
@@ -53,6 +56,8 @@ class DepthModelSpec(BaseModel):
     """Focal length in pixels (at network resolution) for which the depth range is meant."""
     volume: VolumeSpec | None = None
     """For `network: vfdepth`: the volume that the cameras are fused in."""
+    cross_view: CrossViewSpec | None = None
+    """For `network: surrounddepth`: its transformers."""
 
     @property
     def kind(self) -> str:
@@ -85,15 +90,21 @@ class DepthModelSpec(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _volume_is_the_published_one(cls, fields: Any) -> Any:
-        if isinstance(fields, dict) and fields.get("network") == VFDEPTH and fields.get("volume") is None:
-            return fields | {"volume": VolumeSpec()}
-        return fields
+    def _part_of_the_network_is_the_usual_one(cls, fields: Any) -> Any:
+        if not isinstance(fields, dict):
+            return fields
+        usual: dict[str, dict[str, BaseModel]] = {
+            VFDEPTH: {"volume": VolumeSpec()},
+            SURROUNDDEPTH: {"cross_view": CrossViewSpec()},
+        }
+        missing = usual.get(str(fields.get("network")), {})
+        return fields | {name: part for name, part in missing.items() if fields.get(name) is None}
 
     @model_validator(mode="after")
-    def _volume_is_the_networks(self) -> DepthModelSpec:
-        if self.volume is not None and self.network != VFDEPTH:
-            raise ValueError(f"volume is given, but the network {self.network} has none: expected network {VFDEPTH}")
+    def _parts_are_the_networks(self) -> DepthModelSpec:
+        for name, part, owner in (("volume", self.volume, VFDEPTH), ("cross_view", self.cross_view, SURROUNDDEPTH)):
+            if part is not None and self.network != owner:
+                raise ValueError(f"{name} is given, but the network {self.network} has none: expected network {owner}")
         return self
 
     @model_validator(mode="after")
@@ -116,8 +127,9 @@ class DepthModelSpec(BaseModel):
         fields: dict[str, Any] = serialise(self)
         if fields.get("network") == PER_CAMERA:
             del fields["network"]
-        if fields.get("volume") is None:
-            fields.pop("volume", None)
+        for name in ("volume", "cross_view"):
+            if fields.get(name) is None:
+                fields.pop(name, None)
         return fields
 
 
@@ -165,6 +177,7 @@ NETWORKS: dict[str, Callable[[DepthModelSpec], DepthNetwork]] = {
     PER_CAMERA: lambda spec: DepthNet(spec.encoder),
     RIG_CONDITIONED: lambda spec: RigConditionedNet(spec.min_depth, spec.max_depth, spec.focal_scale),
     VFDEPTH: _fused,
+    SURROUNDDEPTH: lambda spec: CrossViewDepthNet(spec.encoder, spec.cross_view or CrossViewSpec()),
 }
 """Each kind's name in checkpoints and training files, and what builds one with random weights."""
 

@@ -256,7 +256,8 @@ def _with_network(fields: dict[str, Any], start: DepthModelSpec | None) -> dict[
     scale = width / start.width if isinstance(width, int) else 1.0
     known = {"network": start.network, **start.model_dump(), "focal_scale": start.focal_scale * scale}
     if named.get("network", start.network) != start.network:
-        known.pop("volume", None)
+        for part in ("volume", "cross_view"):
+            known.pop(part, None)
     return {**fields, "depth": known | named}
 
 

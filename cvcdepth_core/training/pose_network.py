@@ -15,6 +15,7 @@ from torch import Tensor
 from cvcdepth_core.errors import CheckpointError
 from cvcdepth_core.networks import PoseNet, RigImages
 from cvcdepth_core.networks.checkpoint import Checkpoint, load_network_state
+from cvcdepth_core.networks.registry import SURROUNDDEPTH
 from cvcdepth_core.networks.vfdepth import VolumePoseNet
 from cvcdepth_core.networks.volume import VolumeSpec
 from cvcdepth_core.rig.poses import Pose, inverse
@@ -158,6 +159,8 @@ def pose_score_to_json(score: PoseScore | None) -> dict[str, float | None]:
 
 def _method_of(checkpoint: Checkpoint) -> str:
     """Return what a checkpoint that does not tell its configuration must be: released weights have none."""
+    if checkpoint.spec.network == SURROUNDDEPTH:
+        return "joint"
     return "volume" if any(key.startswith("birds_eye.") for key in checkpoint.pose_net) else "front"
 
 

