@@ -4,6 +4,7 @@
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -49,6 +50,26 @@ class CloudLimits:
         return replace(self, voxel=0.0, min_height=-np.inf, max_height=np.inf)
 
 
+class CameraMoments(NamedTuple):
+    """How points of cameras that do not fire together come to the moment of one cloud."""
+
+    base_T_camera: NDArray[np.float64]
+    """[N, 4, 4] each camera at its exposure, in the base frame at the cloud's moment."""
+    seconds: NDArray[np.float64] | None = None
+    """[N] by which each exposure is later than the cloud's moment; None: points do not tell it."""
+
+    @classmethod
+    def moved(cls, rig: Rig, world_T_base: NDArray[np.float64], anchor: int) -> "CameraMoments":
+        """Return those of a rig whose vehicle was at `world_T_base` [N, 4, 4] at the exposures; `anchor`'s is meant."""
+        poses = np.stack([camera.base_T_camera for camera in rig.cameras])
+        return cls(np.linalg.inv(world_T_base[anchor]) @ world_T_base @ poses)
+
+    @classmethod
+    def unmoved(cls, rig: Rig) -> "CameraMoments":
+        """Return those of a vehicle that stands."""
+        return cls(np.stack([camera.base_T_camera for camera in rig.cameras]))
+
+
 def organised_cloud(surround: SurroundDepth, camera: int, min_confidence: float = 0.0) -> Cloud:
     """Return one camera's cloud [H, W, 4] in its optical frame.
 
@@ -62,12 +83,17 @@ def organised_cloud(surround: SurroundDepth, camera: int, min_confidence: float 
     return cloud
 
 
-def merged_cloud(surround: SurroundDepth, rig: Rig, limits: CloudLimits) -> Cloud:
-    """Return the points of all cameras with known depth inside `limits`, [M, 4] in the base frame; none of the sky."""
+def merged_cloud(surround: SurroundDepth, rig: Rig, limits: CloudLimits, moments: CameraMoments | None = None) -> Cloud:
+    """Return the points of all cameras with known depth inside `limits`, [M, 4] in the base frame; none of the sky.
+
+    `moments` say where the cameras were at their exposures; without, the vehicle is taken to stand. Where these have
+    seconds, there is a fifth column with those of each point's camera, float32.
+    """
+    moments = moments or CameraMoments.unmoved(rig)
     merged = np.empty((surround.depth[:, :: limits.stride, :: limits.stride].size, 4), dtype=np.float32)
-    end = 0
+    end, counts = 0, np.zeros(len(surround.present), dtype=np.int64)
     for camera in np.flatnonzero(surround.present).tolist():
-        base_T_camera = rig.cameras[camera].base_T_camera
+        begin, base_T_camera = end, moments.base_T_camera[camera]
         rays = base_T_camera[:3, :3] @ np.linalg.inv(surround.intrinsics[camera])
         depth, picture = surround.sure_depth(camera, limits.min_confidence), surround.pictures[camera]
         view = _View(depth, picture, rays, base_T_camera[:3, 3], limits.stride)
@@ -77,12 +103,16 @@ def merged_cloud(surround: SurroundDepth, rig: Rig, limits: CloudLimits) -> Clou
             view.depth = np.where(edges, np.float32(np.nan), view.depth)
         for rows in view.blocks():
             end += _append(view, rows, limits, merged[end:])
-    inside = banded(merged[:end], limits)
+        counts[camera] = end - begin
+    points = merged[:end]
+    if moments.seconds is not None:
+        points = np.column_stack([points, np.repeat(moments.seconds.astype(np.float32), counts)])
+    inside = banded(points, limits)
     return thinned(inside, limits.voxel) if limits.voxel else inside
 
 
 def banded(points: Cloud, limits: CloudLimits) -> Cloud:
-    """Return the points [M, 4] of the base frame whose height is inside `limits`: all of them, where they all are."""
+    """Return the points [M, 3 or more] of the base frame whose height is inside `limits`."""
     inside = (points[:, 2] >= limits.min_height) & (points[:, 2] <= limits.max_height)
     return points if inside.all() else points[inside]
 
@@ -155,11 +185,11 @@ def pack_rgb(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def thinned(points: Cloud, edge: float) -> Cloud:
-    """Return the first of the points [M, 4] in each cube of `edge` metres, in their order.
+    """Return the first of the points [M, 3 or more] in each cube of `edge` metres, in their order.
 
     A hash table without chains: in every round each slot goes to one voxel, and those that did not get one try again.
     """
-    voxels = _voxels(points, edge)
+    voxels = cube_numbers(points, edge)
     table = np.empty(1 << _TABLE_BITS, dtype=np.int64)
     first = np.zeros(len(points), dtype=np.bool_)
     left = np.arange(len(points))
@@ -174,11 +204,13 @@ def thinned(points: Cloud, edge: float) -> Cloud:
     return points[first]
 
 
-def _voxels(points: Cloud, edge: float) -> NDArray[np.uint64]:
-    """Return the number [M] of the cube that each point lies in."""
+def cube_numbers(
+    points: Cloud, edge: float, origin: NDArray[np.int64] | tuple[int, int, int] = (0, 0, 0)
+) -> NDArray[np.uint64]:
+    """Return the number [M] of the cube of `edge` metres that each point lies in; `origin` counts cubes [3] too."""
     numbers = np.zeros(len(points), dtype=np.uint64)
     mask = np.uint64(2**_VOXEL_BITS - 1)
     for axis in range(3):
-        cells = np.floor(points[:, axis] * np.float32(1 / edge)).astype(np.int64).view(np.uint64)
+        cells = (np.floor(points[:, axis] * np.float32(1 / edge)).astype(np.int64) + origin[axis]).view(np.uint64)
         numbers = numbers << np.uint64(_VOXEL_BITS) | cells & mask
     return numbers

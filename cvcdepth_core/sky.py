@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cvcdepth_core.surround_depth import SurroundPictures
 
-_FAR_SHARE = 0.9
+_FAR_SHARE = 0.5
 """Of the farthest depth that a network can say: beyond is sky, or as good as that."""
 
 _WIDTH = 160  # columns, about, of the picture that is searched
@@ -96,7 +96,8 @@ def _smooth_sky(
     sky = np.zeros(regions.shape, dtype=np.bool_)
     for region in np.flatnonzero(large[1:]) + 1:
         found = regions == region
-        if np.median(metres[found]) >= _NEAREST and _looks_like_sky(small, found, upward):
+        is_far = 2 * np.count_nonzero(metres[found] >= _NEAREST) >= np.count_nonzero(found)
+        if is_far and _looks_like_sky(small, found, upward):
             sky |= found
     return sky
 
@@ -104,22 +105,23 @@ def _smooth_sky(
 def _smooth(small: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Return which pixels [h, w] differ little from those beside and below them, in every colour."""
     rough = np.zeros(small.shape[:2], dtype=np.bool_)
-    across, down = (np.abs(np.diff(small, axis=axis)).max(axis=2) > _SMOOTH for axis in (1, 0))
-    rough[:, 1:] |= across
-    rough[1:] |= down
+    for colour in cv2.split(small):
+        rough[:, 1:] |= np.abs(colour[:, 1:] - colour[:, :-1]) > _SMOOTH
+        rough[1:] |= np.abs(colour[1:] - colour[:-1]) > _SMOOTH
     return ~rough
 
 
 def _looks_like_sky(small: NDArray[np.float32], region: NDArray[np.bool_], upward: NDArray[np.float32]) -> bool:
-    red, green, blue = np.median(small[region], axis=0).tolist()
+    red, green, blue = small[region].mean(axis=0).tolist()
     ground = small[upward < 0]
-    darkest = float(np.median(ground)) if ground.size else 0.0
-    return bool(blue - red > -_WARMEST and (red + green + blue) / 3 >= darkest)
+    below = float(ground.mean()) if ground.size else 0.0
+    return bool(blue - red > -_WARMEST and (red + green + blue) / 3 >= below)
 
 
 def _is_like(small: NDArray[np.float32], seed: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return which pixels [h, w] have the seed's colour."""
-    colours = small[seed]
-    deviation = np.maximum(colours.std(axis=0), _LEAST_DEVIATION)
-    like: NDArray[np.bool_] = (np.abs(small - colours.mean(axis=0)) < _LIKE_THE_SKY * deviation).all(axis=2)
+    like = np.ones(seed.shape, dtype=np.bool_)
+    for colour in cv2.split(small):
+        of_sky = colour[seed]
+        like &= np.abs(colour - of_sky.mean()) < _LIKE_THE_SKY * max(float(of_sky.std()), _LEAST_DEVIATION)
     return like

@@ -193,6 +193,14 @@ class OutputSettings(SkySettings):
     cloud_edge_clearance: float = Field(0.0, ge=0, le=10)
     """Merged cloud and obstacles: leave out edges of depth, that is surfaces that would pass nearer than so many metres
     by their camera; 0 keeps them."""
+    cloud_deskew: bool = False
+    """Merged cloud and what is made of it: move every camera's points to the anchor's moment, by the vehicle's motion
+    (odometry, /tf, or with refinement the pictures); points stay where they are while that is not known."""
+    cloud_persistence: int = Field(0, ge=0, le=10)
+    """Merged cloud and what is made of it: keep points near which each of so many earlier sets had one too, where the
+    vehicle's motion is known; 0 keeps all."""
+    cloud_times: bool = False
+    """Merged cloud, obstacles and ground: a field t, the seconds by which a point was seen later than the stamp."""
     obstacle_min_height: float = Field(0.3, ge=0, le=100)
     """Obstacles: metres above the ground that was found from which points are obstacles, and no ground."""
     obstacle_max_height: float = Field(2.0, gt=0, le=100)
@@ -246,6 +254,11 @@ class OutputSettings(SkySettings):
             if least >= most:
                 raise ValueError(f"{kind}_min_height {least:g} must be below {kind}_max_height {most:g}")
         return self
+
+    @property
+    def needs_poses(self) -> bool:
+        """Whether any output depends on where the vehicle was at the exposures."""
+        return self.cloud_deskew or self.cloud_persistence > 0
 
     @property
     def needs_confidence(self) -> bool:

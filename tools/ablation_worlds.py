@@ -52,6 +52,7 @@ ROWS = {
     REFERENCE: "front_pose.yaml",
     "all": "../ddad_r18.yaml",
     "+ DDCL": "front_pose_ddcl.yaml",
+    "+ DDCL as a share (ours)": "front_pose_ddcl.yaml",
     "+ MVRCL": "front_pose_mvrcl.yaml",
     "+ Hflip-S of both": "front_pose_hflip.yaml",
     "FSM baseline (a)": "fsm_baseline.yaml",
@@ -62,6 +63,9 @@ ROWS = {
     "+ Hflip-S of pose": "front_pose_hflip_pose.yaml",
 }
 """In the order in which they are trained: what an interrupted ablation has first says most."""
+# At the truth of a rendered drive the term in metres is about 14, the share 0.05: the same part of the loss.
+CHANGES = {"+ DDCL as a share (ours)": {"depth_difference": "share", "depth_consistency": 0.2}}
+"""What rows that are not the paper's change of their file's objective."""
 KINDS: tuple[WorldKind, ...] = ("city", "suburb", "rural", "industrial", "highway", "square", "forest")
 RATE = 10.0
 LEAST_SPEED = 2.0  # metres per second; slower drives teach nothing
@@ -96,7 +100,8 @@ def planned_runs(options: argparse.Namespace) -> Iterator[Run]:
         for variant in options.rows or ROWS:
             row = load_training_config(PUBLISHED / ROWS[variant])
             pose = base.pose.model_copy(update={"method": row.pose.method})
-            changes = {"objective": row.objective, "augmentation": row.augmentation, "pose": pose, "seed": seed}
+            objective = row.objective.model_copy(update=CHANGES.get(variant, {}))
+            changes = {"objective": objective, "augmentation": row.augmentation, "pose": pose, "seed": seed}
             yield planned_run(variant, seed, base.model_copy(update=changes), options.output / "runs")
 
 
@@ -241,6 +246,8 @@ def difference(found: Mapping[str, Sequence[Scores]], variant: str, scaling: Sca
 
 def published(variant: str) -> str:
     """Return the paper's Abs Rel on DDAD, which the row's file tells; that of all is in docs/method.md."""
+    if variant in CHANGES:
+        return ""
     told = re.search(r"Abs Rel (0\.\d+)", (PUBLISHED / ROWS[variant]).read_text(encoding="utf-8"))
     return told.group(1) if told else "0.210"
 

@@ -6,7 +6,8 @@
 Simulated drives (`simulate --truth all`) are scored by their depth, the street by its LiDAR: as they are; the street
 shown by other rigs (views of the same pictures, with calibration and poses that fit them); and with a network that is
 told its rig wrongly, or sees other weather, while truth stays where it is. One process and one thread; `rows.jsonl`
-keeps what is done, so that the same command goes on where it was killed.
+keeps what is done, so that the same command goes on where it was killed. Of the first set of each there is a picture:
+the cameras, the network's depth, the truth; red is 1 m, dark blue 80.
 """
 
 from __future__ import annotations
@@ -29,13 +30,15 @@ from cvcdepth_core.errors import CvcDepthError
 from cvcdepth_core.estimator import DepthEstimator, SurroundDepthEstimator
 from cvcdepth_core.model_choices import checkpoint_path
 from cvcdepth_core.rig.rig_file import CameraEntry, PoseEntry, RigLayout, load_rig_layout
-from cvcdepth_core.rig.view import Aspect
-from cvcdepth_core.scoring.ground_truth import sample_prediction
+from cvcdepth_core.rig.view import Aspect, PicturePart
 from cvcdepth_core.scoring.metrics import median_ratio, sum_errors
+from cvcdepth_core.scoring.obstacles import ObstacleScorer, ObstacleScores
 from cvcdepth_core.scoring.references import best_constant
 from cvcdepth_core.scoring.scorer import DepthSamples
+from cvcdepth_core.scoring.sky import SkyCounts
 from cvcdepth_core.scoring.sparse_depth import SparseDepth
 from cvcdepth_core.surround_depth import SurroundPictures
+from cvcdepth_core.visualization import DepthScale
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.evaluation.job import EvaluationJob, EvaluationSettings
 from cvcdepth_ros.evaluation.measuring import MeasuredSet, RecordingEvaluation
@@ -104,6 +107,7 @@ class Rows:
 
     def __init__(self, path: Path, weights: str) -> None:
         self._path, self._weights = path, weights
+        self.folder = path.parent
         lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
         self.rows: list[Row] = [row for row in map(json.loads, lines) if row["weights"] == weights]
 
@@ -123,25 +127,29 @@ class Rows:
 
 def score_source(source: Source, estimator: DepthEstimator, kept: Rows) -> None:
     """Score a recording as it is, with what is told or seen changed, and the street as other rigs show it."""
-    told = [case for case in CHANGES if not kept.has(source.name, TOLD, case)]
+    told = [case for case in cases_of(estimator) if not kept.has(source.name, TOLD, case)]
     if told or not kept.has(source.name, source.kind, AS_IT_IS):
         scene = read(source, estimator)
         if not kept.has(source.name, source.kind, AS_IT_IS):
+            draw(scene, kept.folder / f"{source.name}.jpg")
             kept.add(source.name, source.kind, AS_IT_IS, scored(scene, estimator, unchanged))
         for case in told:
             kept.add(source.name, TOLD, case, scored(scene, estimator, CHANGES[case]))
     for case, shown in SHOWN_BY.items() if source.kind == STREET else ():
         if not kept.has(source.name, SHOWN, case):
-            kept.add(source.name, SHOWN, case, scored_as_shown(source, estimator, shown))
+            picture = kept.folder / f"{source.name}_{list(SHOWN_BY).index(case) + 1}.jpg"
+            kept.add(source.name, SHOWN, case, scored_as_shown(source, estimator, shown, picture))
 
 
-def scored_as_shown(source: Source, estimator: DepthEstimator, shown: Shown) -> Row:
+def scored_as_shown(source: Source, estimator: DepthEstimator, shown: Shown, picture: Path) -> Row:
     """Score the recording as another rig shows it, or say why the rig is refused."""
     with open_recording(source.path) as recording:
         layout = RecordedRig.from_recording(recording, source.layout).completed().layout
     other = source._replace(layout=shown_by(layout, shown))
     try:
-        return scored(read(other, estimator), estimator, unchanged)
+        scene = read(other, estimator)
+        draw(scene, picture)
+        return scored(scene, estimator, unchanged)
     except CvcDepthError as error:
         return {"refused": str(error)}
 
@@ -160,21 +168,28 @@ def read(source: Source, estimator: DepthEstimator) -> Scene:
 def scored(scene: Scene, estimator: DepthEstimator, change: Change) -> Row:
     """Score the network on every set after a change: means over images, then over cameras."""
     images: dict[str, list[Row]] = {name: [] for name in scene.cameras}
-    sky = np.zeros(3, np.int64)
-    for number, measured in enumerate(scene.sets):
-        result = measured.estimated.result
-        pictures = SurroundPictures(
-            result.pictures, result.present, result.intrinsics, scene.base_T_camera, scene.valid
-        )
-        found = estimator.details(change(pictures, np.random.default_rng(number)))
-        known = scene.valid & result.present[:, None, None]
-        depth = np.where(known, found.depth, np.float32(np.nan))
-        estimated = replace(measured.estimated, result=replace(result, depth=depth))
-        for name, samples in zip(scene.cameras, replace(measured, estimated=estimated).samples(), strict=True):
+    sky, obstacles = SkyCounts(), ObstacleScorer()
+    for number, known in enumerate(scene.sets):
+        measured = estimated_anew(known, scene, estimator, change, np.random.default_rng(number))
+        for name, samples in zip(scene.cameras, measured.samples(), strict=True):
             images[name] += image_scores(samples)
-        if found.sky is not None:
-            sky += sky_counts(measured, np.where(known, found.sky, np.float32(np.nan)))
-    return joined(images, sky)
+        sky += measured.sky(MAX_DEPTH)
+        estimated = measured.estimated
+        obstacles.add(estimated.result, estimated.rig, measured.truth, None, measured.stamp_ns)
+    return joined(images, sky, obstacles.scores())
+
+
+def estimated_anew(
+    measured: MeasuredSet, scene: Scene, estimator: DepthEstimator, change: Change, random: np.random.Generator
+) -> MeasuredSet:
+    """Return the set with the network's depth after a change; its truth stays."""
+    result = measured.estimated.result
+    shown = SurroundPictures(result.pictures, result.present, result.intrinsics, scene.base_T_camera, scene.valid)
+    changed = change(shown, random)
+    found = estimator.estimate(changed)
+    known = scene.valid & result.present[:, None, None]
+    depth, sky = np.where(known, found, np.float32(np.nan)), estimator.sky(changed, found) & known
+    return replace(measured, estimated=replace(measured.estimated, result=replace(result, depth=depth, sky=sky)))
 
 
 def image_scores(samples: DepthSamples) -> list[Row]:
@@ -195,19 +210,7 @@ def image_scores(samples: DepthSamples) -> list[Row]:
     ]
 
 
-def sky_counts(measured: MeasuredSet, sky: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Return how many pixels with truth show the sky and are told as sky, either, and all (dense truth only)."""
-    counts = np.zeros(3, np.int64)
-    for truth, told, part in zip(measured.truth, sky, measured.parts, strict=True):
-        rows, columns = truth.sky.T
-        at_sky = SparseDepth(rows, columns, np.zeros(len(rows)), truth.height, truth.width)
-        there, elsewhere = (sample_prediction(told, pixels, part) for pixels in (at_sky, truth))
-        hit, false = int((there > 0.5).sum()), int((elsewhere > 0.5).sum())
-        counts += (hit, int((~np.isnan(there)).sum()) + false, int((~np.isnan(there)).sum()))
-    return counts
-
-
-def joined(images: dict[str, list[Row]], sky: NDArray[np.int64]) -> Row:
+def joined(images: dict[str, list[Row]], sky: SkyCounts, obstacles: ObstacleScores) -> Row:
     """Return one row of all cameras."""
     cameras = {
         name: {key: mean(row[key] for row in rows) for key in rows[0]} | {"scale": median_of(rows, "scale")}
@@ -221,7 +224,9 @@ def joined(images: dict[str, list[Row]], sky: NDArray[np.int64]) -> Row:
         "scale": geometric_mean(row["scale"] for row in cameras.values()),
         "worst": [worst, cameras[worst]["abs_rel"]],
         "better": [sum(row["abs_rel"] < row["constant"] for row in cameras.values()), len(cameras)],
-        "sky_iou": float(sky[0] / sky[1]) if sky[2] else None,
+        "sky_iou": sky.iou,
+        "recall": float(obstacles.recall()[0, -1]),
+        "precision": float(obstacles.precision()[0, -1]),
         "images": sum(map(len, images.values())),
     }
 
@@ -229,6 +234,29 @@ def joined(images: dict[str, list[Row]], sky: NDArray[np.int64]) -> Row:
 def median_of(rows: Sequence[Row], key: str) -> float:
     """Return the median of a column."""
     return float(np.median([row[key] for row in rows]))
+
+
+def draw(scene: Scene, path: Path) -> None:
+    """Write the cameras' pictures of the first set, the network's depth and the truth."""
+    measured = scene.sets[0]
+    result = measured.estimated.result
+    truth = [near_points(*each, *result.depth.shape[1:]) for each in zip(measured.truth, measured.parts, strict=True)]
+    scale = DepthScale()
+    rows = [result.pictures, scale.colours(result.depth), scale.colours(np.stack(truth))]
+    sheet = np.concatenate([np.concatenate(list(row), axis=1) for row in rows])
+    cv2.imwrite(str(path), sheet[..., ::-1])
+
+
+def near_points(truth: SparseDepth, part: PicturePart, height: int, width: int) -> NDArray[np.float32]:
+    """Return truth [H, W] in the network's picture: the nearest of the points in and beside each pixel."""
+    rows = np.floor((truth.rows + 0.5 - part.top) * height / part.height).astype(np.int64)
+    columns = np.floor((truth.columns + 0.5 - part.left) * width / part.width).astype(np.int64)
+    inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+    nearness = np.zeros((height, width), np.float32)
+    np.maximum.at(nearness, (rows[inside], columns[inside]), (1 / truth.depth[inside]).astype(np.float32))
+    grown = cv2.dilate(nearness, np.ones((3, 3), np.uint8))
+    with np.errstate(divide="ignore"):
+        return np.where(grown > 0, 1 / grown, np.nan).astype(np.float32)
 
 
 # What the network is told, or sees.
@@ -296,7 +324,7 @@ def blur(picture: NDArray[np.float32], _: np.random.Generator) -> NDArray[np.flo
 
 
 AS_IT_IS = "as it is"
-CHANGES: dict[str, Change] = {
+TOLD_WRONGLY: dict[str, Change] = {
     "cameras told 10 % higher": told_height(1.1),
     "cameras told 10 % lower": told_height(0.9),
     "ground told 0.4 m too low": told_height(metres=0.4),
@@ -306,10 +334,18 @@ CHANGES: dict[str, Change] = {
     "pitch told 2 degrees down": told_turned(pitch=2),
     "pitch told 2 degrees up": told_turned(pitch=-2),
     "roll told 2 degrees": told_turned(roll=2),
+}
+CHANGES: dict[str, Change] = {
+    **TOLD_WRONGLY,
     "night": seen(night),
     "rain": seen(rain),
     "blur": seen(blur),
 }
+
+
+def cases_of(estimator: DepthEstimator) -> list[str]:
+    """Return the changes that can change anything."""
+    return [case for case in CHANGES if estimator.spec.is_told_its_rig or case not in TOLD_WRONGLY]
 
 
 # The same pictures as another rig shows them.
@@ -382,6 +418,7 @@ TITLES = (
     "best constant",
     "cameras better",
     "sky IoU",
+    "obstacles within 20 m: recall / precision",
 )
 
 
@@ -418,6 +455,7 @@ def mean_row(rows: Sequence[Row]) -> Row:
         "worst": max((row["worst"] for row in rows), key=lambda worst: worst[1]),
         "better": [sum(row["better"][i] for row in rows) for i in range(2)],
         "sky_iou": mean(told) if told else None,
+        **{key: mean(row[key] for row in rows) for key in ("recall", "precision")},
     }
 
 
@@ -430,12 +468,13 @@ def table(title: str, rows: Sequence[tuple[str, Row]]) -> str:
 def cells(row: Row) -> list[str]:
     """Return what stands below the titles."""
     if "refused" in row:
-        return [f"refused: {row['refused']}", *[""] * (len(TITLES) - 1)]
+        return [f"refused: {row['refused'].partition(',')[0]}", *[""] * (len(TITLES) - 1)]
     camera, worst = row["worst"]
     better, cameras = row["better"]
     sky = "" if row["sky_iou"] is None else f"{row['sky_iou']:.2f}"
     numbers = [f"{row['abs_rel']:.3f}", f"{row['delta']:.2f}", f"{row['scale']:.2f}"]
-    return [*numbers, f"{camera} {worst:.3f}", f"{row['constant']:.3f}", f"{better} of {cameras}", sky]
+    obstacles = f"{row['recall']:.2f} / {row['precision']:.2f}"
+    return [*numbers, f"{camera} {worst:.3f}", f"{row['constant']:.3f}", f"{better} of {cameras}", sky, obstacles]
 
 
 def sources(options: argparse.Namespace) -> Iterator[Source]:

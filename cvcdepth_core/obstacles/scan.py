@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from cvcdepth_core.obstacles.separation import SeparatedCloud
 
+_MOST_GROUND = 20000  # points, about, of which the directions in which ground is seen are taken
+
 
 @dataclass(frozen=True)
 class ScanLimits:
@@ -51,7 +53,8 @@ def scan_of(cloud: SeparatedCloud, limits: ScanLimits, max_range: float) -> Scan
     """Return the nearest obstacle in every direction, up to `max_range` metres."""
     beams = limits.beams
     ranges = np.full(beams, np.nan, dtype=np.float32)
-    ranges[_beams_of(cloud.ground, beams)] = np.inf
+    ground = cloud.ground
+    ranges[_beams_of(ground[:: max(len(ground) // _MOST_GROUND, 1)], beams)] = np.inf
     obstacles = cloud.obstacles
     distances = np.hypot(obstacles[:, 0], obstacles[:, 1])
     inside = (distances >= limits.min_range) & (distances <= max_range)

@@ -172,6 +172,8 @@ def _prepared(first: RoadView, second: RoadView) -> _Pair | None:
     """Return a pair's patches; None where there are too few."""
     grey, other = _grey(first.picture), _grey(second.picture)
     middles = _textured(grey, _road(first))
+    if len(middles) < _FEWEST_PATCHES:
+        return None
     offsets = np.stack(np.meshgrid(*[np.arange(-_RADIUS, _RADIUS + 1)] * 2), axis=-1).reshape(-1, 2)
     pixels = (middles[:, None] + offsets).astype(np.float64)  # [P, S, 2]
     still = (_patches(grey, pixels) * _patches(other, pixels)).sum(axis=1) > _STILL

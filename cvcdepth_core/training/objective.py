@@ -50,7 +50,7 @@ class ObjectiveConfig(BaseModel):
     spatio_temporal: float = Field(default=0.1, ge=0)
     """Weight of the photometric error of views rendered from the neighbouring cameras at the context moments."""
     depth_consistency: float = Field(default=0.001, ge=0)
-    """Weight, per metre, of the difference to the neighbours' depth (DDCL or DCL)."""
+    """Weight, per metre, of the difference to the neighbours' depth (DDCL or DCL); see `depth_difference`."""
     reconstruction_consistency: float = Field(default=0.2, ge=0)
     """Weight of the difference between spatial and spatio-temporal reconstructions (MVRCL)."""
     pose_consistency: float = Field(default=0.0, ge=0)
@@ -77,6 +77,9 @@ class ObjectiveConfig(BaseModel):
     outline: without parallax nothing holds it where it is. Of networks that tell the sky; truth has to teach it."""
     depth_warping: Literal["ddcl", "dcl"] = "ddcl"
     """How the neighbour's depth comes to the camera: dense backward warping (DDCL) or sparse splatting (DCL)."""
+    depth_difference: Literal["metres", "share"] = "metres"
+    """How two depths of the same place are compared: by their difference in metres, as published, which is smaller the
+    nearer everything is, or by its share of their sum, |a - b| / (a + b), which no scale makes smaller by itself."""
     corrected: bool = False
     """Depart from the published method: refuse points behind a camera, take the deviation for the intensity alignment
     over the overlap only, average instead of add where two neighbours see the same pixel, binarise masks, and leave
@@ -228,7 +231,8 @@ def _self_supervised_terms(
     if "reconstruction_consistency" in terms:
         terms["reconstruction_consistency"] = terms["reconstruction_consistency"].mean(dim=1)
     if config.smoothness > 0:
-        shown = batch.masks if config.corrected or config.leave_out_sky else None
+        leaves_out_sky = config.leave_out_sky and prediction.sky is not None
+        shown = batch.masks if config.corrected or leaves_out_sky else None
         terms["smoothness"] = smoothness(prediction.disparity, batch.images, shown)
     if config.pose_consistency > 0:
         seen = motions_seen_from_anchor(prediction.motions, batch.base_T_camera, batch.anchor)
@@ -451,7 +455,7 @@ def _masked_errors(
     depth = overlap.depth
     if depth is not None:
         mask = batch.masks * _depth_mask(depth, batch.masks * overlap.spatial_masks, config)
-        errors["depth_consistency"] = [MaskedError((depth - prediction.depth).abs(), mask)]
+        errors["depth_consistency"] = [MaskedError(_depth_difference(depth, prediction.depth, config), mask)]
     return errors
 
 
@@ -480,6 +484,13 @@ def _overlap_errors(
         difference = photometric_error(spatio_temporal, spatial)
         errors["reconstruction_consistency"] = MaskedError(difference, st_masks * spatial_mask[:, None], strips)
     return errors
+
+
+def _depth_difference(neighbours_depth: Tensor, depth: Tensor, config: ObjectiveConfig) -> Tensor:
+    difference = (neighbours_depth - depth).abs()
+    return (
+        difference if config.depth_difference == "metres" else difference / (neighbours_depth + depth).clamp(min=1e-3)
+    )
 
 
 def _depth_mask(neighbours_depth: Tensor, spatial_mask: Tensor, config: ObjectiveConfig) -> Tensor:

@@ -99,10 +99,10 @@ class Sensors(Part):
 def random_look(dice: Dice) -> CameraLook:
     """Think up a camera."""
     return CameraLook(
-        key=dice.scale(0.16, 0.42),
+        key=dice.scale(0.17, 0.34),
         white_balance=(dice.scale(0.88, 1.14), 1.0, dice.scale(0.88, 1.14)),
         gamma=dice.between(1.9, 2.5),
-        contrast=dice.between(0.88, 1.25),
+        contrast=dice.between(0.88, 1.2),
         saturation=dice.between(0.65, 1.4),
         vignetting=round(dice.between(0.0, 0.75) ** 1.5, 2),
         bloom=max(0.0, dice.between(-0.3, 0.35)),

@@ -11,6 +11,7 @@ import numpy as np
 from cvcdepth_core.errors import CvcDepthError
 from cvcdepth_ros.checks.context import CheckContext, CheckResult
 from cvcdepth_ros.recordings.compared_pictures import ComparedPictures, compare_pictures, mounts_to_json, parts_of
+from cvcdepth_ros.recordings.ground import with_ground
 from cvcdepth_ros.recordings.rig import RecordedRig
 from cvcdepth_ros.settings import MatchingSettings, ModelSettings
 
@@ -75,6 +76,8 @@ def _compare(context: CheckContext) -> ComparedPictures | CheckResult:
     try:
         recorded = RecordedRig.from_recording(recording, context.layout, options.base_frame)
         network = ModelSettings.model_validate({"checkpoint": path}).build_estimator()
+        if network.spec.is_told_its_rig:
+            recorded, _ = with_ground(recorded, options.lidar)
         return compare_pictures(recorded, network, parts_of(start, stop, _PARTS, _PART_SECONDS), matching)
     except CvcDepthError as error:
         return CheckResult("skipped", str(error))

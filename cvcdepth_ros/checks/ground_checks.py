@@ -3,11 +3,11 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 from cvcdepth_core.errors import CvcDepthError, RigError
-from cvcdepth_core.rig.ground import is_on_ground
+from cvcdepth_core.rig.ground import is_on_ground, refuse_unlikely_ground
 from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.rig_health.ground_height import GroundEstimate
 from cvcdepth_ros.checks.context import CheckContext, CheckResult
@@ -56,6 +56,8 @@ def _by_pictures(context: CheckContext) -> GroundEstimate | str:
 
 def _not_found(rig: Rig, reason: str) -> CheckResult:
     values: dict[str, Any] = {"stated": rig.ground_height, "found": None, "why_not_found": reason}
+    for problem, remedy in _rig_problems(rig):
+        return CheckResult("warning", f"{_stated(rig)}; {problem}", remedy, values)
     if rig.ground_height is not None:
         return CheckResult("passed", f"{_stated(rig)}; nothing to compare it with ({reason})", values=values)
     if is_on_ground(rig.base_frame):
@@ -67,7 +69,8 @@ def _not_found(rig: Rig, reason: str) -> CheckResult:
 def _compared(rig: Rig, found: GroundEstimate, by_pictures: GroundEstimate | str | None) -> CheckResult:
     above = sum(float(camera.base_T_camera[2, 3]) for camera in rig.cameras) / len(rig.cameras) - found.height
     told = [f"{_stated(rig)}; found at {found.height:.2f} m {found.describes}"]
-    problems = [*_height_problems(rig, found, above), *_tilt_problems(rig, found)]
+    known = replace(rig, ground_height=found.height) if rig.ground_height is None else rig
+    problems = [*_rig_problems(known), *_height_problems(rig, found, above), *_tilt_problems(rig, found)]
     if isinstance(by_pictures, GroundEstimate) and by_pictures is not found:
         told[0] += f", at {by_pictures.height:.2f} m {by_pictures.describes}"
         problems += _picture_problems(found, by_pictures, above)
@@ -83,6 +86,15 @@ def _compared(rig: Rig, found: GroundEstimate, by_pictures: GroundEstimate | str
         )
     finding = "; ".join([*told, *(problem for problem, _ in problems)])
     return CheckResult("warning" if problems else "passed", finding, "; ".join(remedies) or None, values)
+
+
+def _rig_problems(rig: Rig) -> list[tuple[str, str]]:
+    """Return why networks that are told their rig refuse it: cameras in the ground, upside down, all at the sky."""
+    try:
+        refuse_unlikely_ground(rig)
+    except RigError as error:
+        return [(str(error), "correct the cameras' transforms; other networks do not need them")]
+    return []
 
 
 def _height_problems(rig: Rig, found: GroundEstimate, above: float) -> list[tuple[str, str]]:

@@ -214,8 +214,9 @@ def _text(result: dict[str, Any]) -> str:
     lines.append(f"{result['epochs']} epochs, {result['steps']} steps ({counts}){early}")
     if result["scores"]["after"]:
         lines += [_score_table(result["scores"]), *filter(None, pose_lines(result["scores"]))]
-    if result["worlds"] and result["worlds"]["scores"]:
-        lines.append(result["worlds"]["scores"]["verdict"])
+    if worlds := result["worlds"]:
+        lines.append(f"{worlds['views_per_step']} views of worlds in each step, of {worlds['training_views']}")
+        lines += [worlds["scores"]["verdict"]] if worlds["scores"] else []
     lines.append(f"{'promoted' if result['promoted'] else 'not promoted'}: {result['verdict']['reason']}")
     return "\n".join([*lines, f"{result['checkpoint']}, started from {result['started_from']}"])
 

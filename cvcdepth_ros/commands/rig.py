@@ -31,7 +31,7 @@ counter-clockwise around the vehicle from the front one, and computes which of t
 finds where a camera sees the vehicle itself, which stands still in the picture while the scene moves, and writes a PNG
 for it beside the rig file. With --rig, a file that names the cameras only (config/rigs/) is completed. With --refine,
 cameras are turned a little so that neighbours' pictures agree where they overlap; it refuses where they do not tell.
-How high the ground lies in the base frame is measured where a LiDAR sees it.
+How high the ground lies in the base frame is measured by LiDAR, or by pictures while the vehicle moves.
 
 With --view the cameras show so much of their lenses, whatever P of camera_info says. A lens of more than 120 degrees is
 shown by two or three virtual cameras, NAME_l, NAME_m and NAME_r."""

@@ -101,7 +101,9 @@ def execute(arguments: argparse.Namespace) -> None:
                 warn(ground.told)
         replay = SurroundReplay(recorded, settings, settings.min_cameras)
         with _trace(arguments.trace) as latencies:
-            depths = DepthReplay(replay, estimator, latencies, settings, settings.wants_confidence)
+            depths = DepthReplay(
+                replay, estimator, latencies, settings, settings.wants_confidence, settings.needs_poses
+            )
             outcome = _record(arguments, settings, replay, depths)
         result = {
             "version": package_version(),

@@ -9,12 +9,11 @@ from pathlib import Path
 
 from cvcdepth_core.engines import resolve_device
 from cvcdepth_core.networks.checkpoint import Checkpoint
-from cvcdepth_core.networks.registry import RIG_CONDITIONED
 from cvcdepth_core.training.config import TrainingConfig
 from cvcdepth_core.training.distributed import Processes, own_device
 from cvcdepth_core.training.starting_model import build_surround_model
 from cvcdepth_core.training.trainer import Trainer, ValidationOutcome
-from cvcdepth_ros.finetuning.world_scores import ViewScores, describe_drives, mean_scores
+from cvcdepth_ros.finetuning.world_scores import NOT_TOLD, ViewScores, describe_drives, mean_scores
 from cvcdepth_ros.installation import package_version
 from cvcdepth_ros.training_data.world_views import WorldBatches
 
@@ -43,7 +42,7 @@ def pretrain(job: PretrainJob, processes: Processes, warn: Callable[[str], None]
     device = own_device(resolve_device(job.device))
     scores = ViewScores(batches.held_out, job.config, device, job.config.evaluation.sets)
     if not job.config.depth.is_told_its_rig:
-        warn(f"depth.network is not {RIG_CONDITIONED}: a network that is not told its rig learns no rig's scale")
+        warn(NOT_TOLD)
     trainer = Trainer(
         job.config,
         build_surround_model(job.config, job.start),

@@ -28,7 +28,7 @@ from cvcdepth_ros.finetuning.preparation import Prepared, Source, prepare
 from cvcdepth_ros.finetuning.provenance import inputs_of, trained_on
 from cvcdepth_ros.finetuning.tensorboard import TensorBoardObserver, has_tensorboard
 from cvcdepth_ros.finetuning.validation import CANDIDATE_FILE, HeldOutValidation
-from cvcdepth_ros.finetuning.world_scores import WorldVerdict, compare_worlds
+from cvcdepth_ros.finetuning.world_scores import NOT_TOLD, WorldVerdict, compare_worlds
 from cvcdepth_ros.installation import package_version
 from cvcdepth_ros.training_data.loader import RecordingBatches
 from cvcdepth_ros.training_data.sample_choice import describe_skipped_samples, describe_unprovable, held_out_sets
@@ -148,6 +148,8 @@ def _warn_of_losses(prepared: Prepared, job: FinetuneJob, warn: Callable[[str], 
     for index in prepared.indexes:
         if told := describe_skipped_samples(index, job.config.recordings):
             prepared.warnings.append(f"{index.path}: {told}")
+    if job.shards and not job.config.depth.is_told_its_rig:
+        prepared.warnings.append(NOT_TOLD)
     for text in (*(f"left out: {reason}" for reason in prepared.left_out.values()), *prepared.warnings):
         warn(text)
 

@@ -40,7 +40,8 @@ def training_pictures(batch: RigBatch, prediction: Prediction, config: Objective
         pictures["from_neighbours"] = _side_by_side(_colours(seen))
     for name, (error, mask) in errors.items():
         shown, seen = (part[:, 0] if part.ndim == 6 else part for part in (error, mask))
-        scaled = shown / prediction.depth if name == "depth_consistency" else shown
+        in_metres = name == "depth_consistency" and config.depth_difference == "metres"
+        scaled = shown / prediction.depth if in_metres else shown
         pictures[f"error_{name}"] = _side_by_side(_heat(scaled[0, :, 0] * (seen[0, :, 0] > 0)))
         pictures[f"mask_{name}"] = _side_by_side(_colours(seen[0].expand(-1, 3, -1, -1)))
     return pictures

@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from cvcdepth_core.networks.checkpoint import load_checkpoint
+from cvcdepth_core.networks.registry import RIG_CONDITIONED
 from cvcdepth_core.scoring.comparison import Comparison, Difference, SetValues, compare_values
 from cvcdepth_core.scoring.metrics import METRIC_NAMES, SUMS, metrics_of, sum_errors
 from cvcdepth_core.training.config import TrainingConfig
@@ -21,9 +22,13 @@ from cvcdepth_core.training.model import SurroundModel
 from cvcdepth_core.training.starting_model import build_surround_model
 from cvcdepth_ros.training_data.world_views import ViewReader, batch_of_views
 
+NOT_TOLD = (
+    f"depth.network is not {RIG_CONDITIONED}: a network that is not told its rig learns no rig's scale from worlds"
+)
 _MIN_DEPTH = 0.5  # metres, of scores
 _TOGETHER = 8  # views that are scored at a time
-_DECIDING = "abs_rel"
+_DECIDING = "delta_1"
+"""The share of pixels within 1.25: one view in which the sky is seen in a wall decides the mean Abs Rel of all."""
 
 
 class ViewScores:
@@ -37,16 +42,20 @@ class ViewScores:
         self.views = [reader.views[i] for i in sorted(chosen.tolist())]
 
     def __call__(self, model: SurroundModel) -> NDArray[np.float64]:
-        """Return the metrics [V, M] of each view's pixels nearer than `evaluation.max_depth`; NaN without any."""
-        rows = []
+        """Return the metrics [V, M] of each view's pixels nearer than `evaluation.max_depth`; NaN without any.
+
+        As in `evaluate`, predictions are clamped: a near pixel that is taken for the sky is wrong, not infinitely so.
+        """
+        rows, farthest = [], self._config.evaluation.max_depth
         for start in range(0, len(self.views), _TOGETHER):
             views = [self._reader.read(v, self._config.worlds, None) for v in self.views[start : start + _TOGETHER]]
             batch = batch_of_views(views).to(self._device)
             as_it_is = torch.zeros(len(views), dtype=torch.bool, device=self._device)
             depth = model(batch, batch.frames, as_it_is, as_it_is).depth[:, 0, 0].double().cpu().numpy()
             for found, view in zip(depth, views, strict=True):
-                known = (view.truth > _MIN_DEPTH) & (view.truth < self._config.evaluation.max_depth)
-                rows.append(sum_errors(found[known], view.truth[known].astype(np.float64)))
+                known = (view.truth > _MIN_DEPTH) & (view.truth < farthest)
+                clamped = found[known].clip(_MIN_DEPTH, farthest)
+                rows.append(sum_errors(clamped, view.truth[known].astype(np.float64)))
         return metrics_of(np.array(rows, SUMS))
 
     def of_file(self, checkpoint: Path) -> NDArray[np.float64]:
@@ -71,7 +80,7 @@ class WorldVerdict:
     after: dict[str, float]
     views: int
     difference: Difference
-    """Of Abs Rel."""
+    """Of the share of pixels within 1.25 of the truth, which is better when higher."""
     is_worse: bool
     """Whether it is proven that the weights know less of worlds than their start."""
 
@@ -80,8 +89,9 @@ class WorldVerdict:
         words = "worse than the start" if self.is_worse else "not proven to be worse than the start"
         one = self.difference
         return (
-            f"{words} on worlds: Abs Rel {one.first:.4f} before, {one.second:.4f} after, difference "
-            f"{one.difference:+.4f} (95% interval {one.low:+.4f} to {one.high:+.4f}, {self.views} held-out views)"
+            f"{words} on worlds: δ < 1.25 {one.first:.4f} before, {one.second:.4f} after, difference "
+            f"{one.difference:+.4f} (95% interval {one.low:+.4f} to {one.high:+.4f}, {self.views} held-out views); "
+            f"Abs Rel {self.before['abs_rel']:.4f} before, {self.after['abs_rel']:.4f} after"
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -96,7 +106,7 @@ def compare_worlds(scores: ViewScores, before: NDArray[np.float64], after: NDArr
     """
     comparison: Comparison = compare_values(_values(scores, before), _values(scores, after), METRIC_NAMES)
     difference = comparison.differences[_DECIDING]
-    is_worse = comparison.can_prove and difference.low > 0
+    is_worse = comparison.can_prove and difference.high < 0
     return WorldVerdict(mean_scores(before), mean_scores(after), len(scores.views), difference, is_worse)
 
 

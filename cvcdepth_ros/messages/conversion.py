@@ -24,6 +24,7 @@ from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_ros.messages.camera_info import read_camera_info
 
 _FLOAT32_DATATYPE = 7  # sensor_msgs/PointField.FLOAT32
+_POINT_FIELDS = ("x", "y", "z", "rgb", "t")
 _MILLIMETRES = 1000.0
 _BIG_ENDIAN_HOST = sys.byteorder == "big"
 
@@ -129,14 +130,17 @@ class MessageFactory:
         )
 
     def point_cloud(self, stamp: int, frame_id: str, cloud: NDArray[np.float32]) -> Any:
-        """Build the PointCloud2 of `cloud` [H, W, 4] (organised) or [M, 4]: x, y, z in metres and packed rgb."""
+        """Build the PointCloud2 of `cloud` [H, W, C] (organised) or [M, C]: x, y, z in metres and packed rgb.
+
+        A fifth column is t, seconds after the stamp.
+        """
         height, width = cloud.shape[:2] if cloud.ndim == 3 else (1, cloud.shape[0])
-        point_step = 4 * cloud.itemsize
+        point_step = cloud.shape[-1] * cloud.itemsize
         return self._class("sensor_msgs/msg/PointCloud2")(
             header=self._header(stamp, frame_id),
             height=height,
             width=width,
-            fields=[self._float_field(name, 4 * i) for i, name in enumerate(("x", "y", "z", "rgb"))],
+            fields=[self._float_field(name, 4 * i) for i, name in enumerate(_POINT_FIELDS[: cloud.shape[-1]])],
             is_bigendian=_BIG_ENDIAN_HOST,
             point_step=point_step,
             row_step=point_step * width,

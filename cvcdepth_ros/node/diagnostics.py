@@ -150,5 +150,16 @@ def ground_plane_status(ground: GroundPlane) -> DiagnosticStatus:
     return status(OK if ground.is_fitted else WARN, "ground plane", ground.describe(), values)
 
 
+def deskew_status(deskewed: bool | None) -> DiagnosticStatus:
+    """Return whether the points of the last merged cloud were moved to its moment; None: there was no cloud yet."""
+    if deskewed is None:
+        return status(OK, "deskew", "no cloud yet")
+    if deskewed:
+        return status(OK, "deskew", "points are moved to the cloud's moment")
+    return status(
+        WARN, "deskew", "points stay where they were seen: the vehicle's motion is not known at the exposures"
+    )
+
+
 def _text(value: Any) -> str:
     return f"{value:.2f}" if isinstance(value, float) else str(value)

@@ -58,6 +58,11 @@ class SurroundOutputs:
         """The ground of the last set whose obstacles were asked for; None before any."""
         return self._messages.ground
 
+    @property
+    def deskewed(self) -> bool | None:
+        """Whether the points of the last merged cloud were moved to its moment; None before any."""
+        return self._messages.deskewed
+
     def publish(self, estimated: EstimatedSet[Any], frame_ids: Mapping[str, str], limits: OutputLimits) -> None:
         """Publish one set; see `SurroundMessages.of_set` for stamps and frames.
 

@@ -26,6 +26,7 @@ from cvcdepth_ros.messages.conversion import stamp_ns
 from cvcdepth_ros.messages.rig_assembly import RigAssembler
 from cvcdepth_ros.node.diagnostics import (
     camera_status,
+    deskew_status,
     ground_plane_status,
     ground_problem,
     ground_status,
@@ -81,6 +82,7 @@ class SurroundSession:
         self._progress = SetProgress(self._synchroniser.required, parameters.tolerance, parameters.max_age)
         self._is_finished = False
         self._needs_confidence = parameters.needs_confidence
+        self._deskews = parameters.cloud_deskew
         with ExitStack() as opened:
             trace = None
             if parameters.trace:
@@ -102,6 +104,7 @@ class SurroundSession:
                 self.latencies,
                 parameters.publish_odometry,
                 lambda: bool(motion.poses.topic),
+                wants_poses=parameters.needs_poses,
             )
             self._pipeline = SurroundPipeline(
                 estimator,
@@ -234,6 +237,7 @@ class SurroundSession:
             *([ground_status(self._assembler.layout)] if self._estimator.spec.is_told_its_rig else []),
             *([overlap_status(self._overlaps)] if self._overlaps else []),
             *([ground_plane_status(self._outputs.ground)] if self._outputs.ground else []),
+            *([deskew_status(self._outputs.deskewed)] if self._deskews else []),
             *([refinement_status(self._refinement, self._motion.poses)] if self._refinement.is_active else []),
         ]
 

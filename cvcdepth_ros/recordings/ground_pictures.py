@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ground of a recording by its pictures: of the same road, taken from two places that recorded motion tells."""
+"""The ground of a recording by its pictures: of the same road, from two places of the moving vehicle or two cameras."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,38 +27,54 @@ from cvcdepth_ros.surround_sets.synchronizer import SurroundSet
 _MOMENTS = 10  # spread over the recording
 _WITHIN_NS = 2 * NANOSECONDS  # of a moment
 _LEAST_TRAVEL, _MOST_TRAVEL = 0.4, 3.0  # metres between two pictures of a pair
+_TOGETHER_NS = 5_000_000  # between shutters of neighbours that are compared: at 10 m/s 5 cm
 _WIDTH = 640  # pixels
 
 
 class _PlacedSet(NamedTuple):
-    """A set, and the vehicle's pose at each camera's exposure."""
+    """A set, and the vehicle's pose at each camera's exposure, none where its motion is not known."""
 
     found: SurroundSet[RecordedImage]
     world_T_base: dict[str, Pose]
 
 
+class _Moment(NamedTuple):
+    """What is compared of a moment."""
+
+    first: _PlacedSet | None
+    second: _PlacedSet | None
+    """From elsewhere; None where the vehicle stands, or its motion is not known."""
+
+
 def ground_by_pictures(recorded: RecordedRig, matching: MatchingSettings) -> GroundEstimate:
-    """Return the ground that the pictures show; RigError says why they do not."""
-    if recorded.vehicle_motion() is None:
-        raise RigError("no recorded motion, which pictures of the road need")
+    """Return the ground that the pictures show; RigError says why they do not.
+
+    Pictures of one camera are compared along the recorded motion, and those of neighbours where their shutters are
+    together, whatever the vehicle does.
+    """
     whole = recorded.with_layout(recorded.layout.model_copy(update={"aspect": "stretch"}))  # all of each picture
     rig = whole.assembler().rig()
     road = _Road(rig)
     if not road.cameras:
         raise RigError("no camera sees the road ahead of the vehicle or behind it")
-    search, standing = GroundFromPictures(rig), 0
+    search, moved = GroundFromPictures(rig), 0
     for start in _starts(recorded):
         pair = _pair(whole, matching, start)
-        if pair is None:
-            standing += 1
-            continue
-        for first, second in road.views(*pair):
+        moved += pair.second is not None
+        for first, second in road.views(pair):
             search.add(first, second)
-    if standing > _MOMENTS // 2:
-        raise RigError(
-            f"at {standing} of {_MOMENTS} moments the vehicle stands still, or its motion or pictures are missing"
-        )
-    return search.estimate()
+    try:
+        return search.estimate()
+    except RigError as error:
+        raise RigError(f"{error}{_without_motion(recorded, moved)}") from error
+
+
+def _without_motion(recorded: RecordedRig, moved: int) -> str:
+    if recorded.vehicle_motion() is None:
+        return "; no motion is recorded, so that only neighbours that fire together could be compared"
+    if moved < _MOMENTS // 2:
+        return f"; at {_MOMENTS - moved} of {_MOMENTS} moments the vehicle stands still, or its motion is not known"
+    return ""
 
 
 class _Road:
@@ -72,18 +89,36 @@ class _Road:
             i for i in range(len(rig.cameras)) if shows_road(self._view(i, blank, rig.cameras[i].base_T_camera))
         ]
 
-    def views(self, first: _PlacedSet, second: _PlacedSet) -> Iterator[tuple[RoadView, RoadView]]:
+    def views(self, pair: _Moment) -> Iterator[tuple[RoadView, RoadView]]:
+        """Yield pairs of pictures with their places: each camera's along the way, and neighbours' at once."""
+        first, second = pair
+        if first is not None and second is not None:
+            yield from self._along_the_way(first, second)
+        elif first is not None:
+            yield from self._between_neighbours(first.found)
+
+    def _along_the_way(self, first: _PlacedSet, second: _PlacedSet) -> Iterator[tuple[RoadView, RoadView]]:
         """Yield both pictures of each camera that has them, in the base frame at its first exposure."""
         for i in self.cameras:
             camera = self._rig.cameras[i]
             first_T_second = inverse(first.world_T_base[camera.name]) @ second.world_T_base[camera.name]
-            try:
+            with suppress(ImageError):  # one damaged picture is one pair less
                 yield (
                     self._view(i, self._picture(i, first.found), camera.base_T_camera),
                     self._view(i, self._picture(i, second.found), first_T_second @ camera.base_T_camera),
                 )
-            except ImageError:  # one damaged picture is one pair less
+
+    def _between_neighbours(self, found: SurroundSet[RecordedImage]) -> Iterator[tuple[RoadView, RoadView]]:
+        for i, j in self._rig.neighbour_indices:
+            names = self._rig.names[i], self._rig.names[j]
+            if i not in self.cameras or not set(names) <= found.images.keys():
                 continue
+            if abs(found.times_ns[names[0]] - found.times_ns[names[1]]) <= _TOGETHER_NS:
+                with suppress(ImageError):
+                    yield self._own_view(i, found), self._own_view(j, found)
+
+    def _own_view(self, index: int, found: SurroundSet[RecordedImage]) -> RoadView:
+        return self._view(index, self._picture(index, found), self._rig.cameras[index].base_T_camera)
 
     def _view(self, index: int, picture: Any, base_T_camera: Pose) -> RoadView:
         valid = self._preprocessor.valid[index]
@@ -104,27 +139,34 @@ def _starts(recorded: RecordedRig) -> list[int]:
     return starts
 
 
-def _pair(recorded: RecordedRig, matching: MatchingSettings, start: int) -> tuple[_PlacedSet, _PlacedSet] | None:
-    """Return the first set after a moment, and the next one that is far enough from it; None where there is none."""
+def _pair(recorded: RecordedRig, matching: MatchingSettings, start: int) -> _Moment:
+    """Return the first set after a moment, and the next one that is far enough from it."""
     motion = RecordedSetMotion.of(recorded)
     first: _PlacedSet | None = None
     for found in SurroundReplay(recorded, matching).sets(start, start + _WITHIN_NS):
-        poses = None
-        if motion is not None:
-            motion.read_to(max(image.log_time for image in found.images.values()))
-            poses = motion.poses_at(found.times_ns)
-        if poses is None:
-            continue
+        placed = _placed(found, motion)
         if first is None:
-            first = _PlacedSet(found, poses)
-            continue
-        travel = _travel(first, poses, found.anchor)
+            first = placed
+        if motion is None:
+            break
+        travel = _travel(first, placed)
         if travel > _MOST_TRAVEL:
-            return None
+            break
         if travel >= _LEAST_TRAVEL:
-            return first, _PlacedSet(found, poses)
-    return None
+            return _Moment(first, placed)
+    return _Moment(first, None)
 
 
-def _travel(first: _PlacedSet, poses: dict[str, Pose], anchor: str) -> float:
-    return float(np.linalg.norm(poses[anchor][:3, 3] - first.world_T_base[anchor][:3, 3]))
+def _placed(found: SurroundSet[RecordedImage], motion: RecordedSetMotion | None) -> _PlacedSet:
+    if motion is None:
+        return _PlacedSet(found, {})
+    motion.read_to(max(image.log_time for image in found.images.values()))
+    return _PlacedSet(found, motion.poses_at(found.times_ns) or {})
+
+
+def _travel(first: _PlacedSet, second: _PlacedSet) -> float:
+    """Return the metres between two sets; 0 where they are not known."""
+    if not first.world_T_base or not second.world_T_base:
+        return 0.0
+    anchor = first.found.anchor
+    return float(np.linalg.norm(second.world_T_base[anchor][:3, 3] - first.world_T_base[anchor][:3, 3]))

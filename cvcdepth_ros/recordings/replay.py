@@ -189,11 +189,14 @@ class DepthReplay:
         latencies: StageLatencies | None = None,
         settings: ModelSettings | None = None,
         wants_confidence: bool = False,
+        wants_poses: bool = False,
     ) -> None:
         """Prepare for the replay's rig; RigError names a mask that does not fit.
 
-        `settings` say whether depth is refined (None: it is not); without, confidence may be wanted all the same.
+        `settings` say whether depth is refined (None: it is not); without, confidence may be wanted all the same, or
+        where the vehicle was at the exposures.
         """
+        self._wants_poses = wants_poses
         self.refused = Refusals()
         self.latencies = latencies or StageLatencies()
         self.estimator = estimator
@@ -201,13 +204,14 @@ class DepthReplay:
         self._surround = SurroundDepthEstimator(replay.rig, estimator)
         settings = settings or ModelSettings.model_validate({"refine": "off"})
         is_compared = wants_confidence or settings.refine != "off"
-        self._motion = motion = RecordedSetMotion.of(replay.recorded) if is_compared else None
+        self._motion = motion = RecordedSetMotion.of(replay.recorded) if is_compared or wants_poses else None
         self.refinement = RefinementStage(
             settings,
             motion.poses_at if motion else lambda _: None,
             lambda: wants_confidence,
             self.latencies,
             knows_motion=lambda: motion is not None,
+            wants_poses=wants_poses,
         )
 
     def sets(
@@ -251,7 +255,7 @@ class DepthReplay:
     def _finished(
         self, surround: SurroundDepthEstimator, surround_set: SurroundSet[RecordedImage], result: SurroundDepth
     ) -> EstimatedSet[RecordedImage]:
-        if self._motion is not None and self.refinement.is_active:
+        if self._motion is not None and (self._wants_poses or self.refinement.is_active):
             with self.latencies.measure("motion"):
                 self._motion.read_to(max(image.log_time for image in surround_set.images.values()))
         return self.refinement.finished(surround, surround_set, result)

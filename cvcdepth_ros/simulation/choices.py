@@ -10,7 +10,7 @@ from typing import Literal, cast, get_args
 import yaml
 from pydantic import ValidationError
 
-from cvcdepth_core.errors import ConfigError, first_validation_message
+from cvcdepth_core.errors import ConfigError, RigError, first_validation_message
 from cvcdepth_core.files import load_yaml
 from cvcdepth_core.rig.rig_file import RigLayout, load_rig_layout
 from cvcdepth_core.worlds.description import WorldSpec
@@ -34,13 +34,27 @@ _WHEELS = Odometry(scale=1.01, noise=0.05, yaw_drift=0.001, latency=0.01)
 def chosen_layout(rig: str, size: tuple[int, int] | None, seed: int) -> RigLayout:
     """Return the rig of a file, one like a data set's, or a random one, with pictures of `size` (width, height).
 
-    Without a size, pictures are 480 pixels wide and keep their shape.
+    Its base frame lies on the ground, as in every world: where a file's lies elsewhere, it is moved there. Without a
+    size, pictures are 480 pixels wide and keep their shape.
     RigError names the file and the camera that lacks its calibration or mount.
     """
     if rig == RANDOM:
-        return layout_at_size(random_rig(seed), size, _USUAL_WIDTH)
+        return _on_ground(layout_at_size(random_rig(seed), size, _USUAL_WIDTH))
     path = share_directory() / "config" / "rigs" / "simulated" / f"{rig}.yaml" if rig in KNOWN_RIGS else Path(rig)
-    return layout_at_size(complete_layout(load_rig_layout(path), f"rig file {path}"), size, _USUAL_WIDTH)
+    layout = complete_layout(load_rig_layout(path), f"rig file {path}")
+    return _on_ground(layout_at_size(layout, size, _USUAL_WIDTH))
+
+
+def _on_ground(layout: RigLayout) -> RigLayout:
+    """Return the rig with its base frame on the ground, and its cameras as high above that as they are."""
+    cameras = []
+    for camera in layout.cameras:
+        if camera.base_T_camera is None:
+            raise RigError(f"camera {camera.name}: no base_T_camera")
+        x, y, z = camera.base_T_camera.translation
+        raised = camera.base_T_camera.model_copy(update={"translation": (x, y, z - layout.ground_z)})
+        cameras.append(camera.model_copy(update={"base_T_camera": raised}))
+    return layout.model_copy(update={"cameras": tuple(cameras), "ground_height": 0.0})
 
 
 def chosen_world(world: str, seed: int, seconds: float) -> WorldSpec:

@@ -37,7 +37,7 @@ class ManyDrives(NamedTuple):
     samples: int
     look: LookChoice
     body: str
-    """none, car, van, robot; or varied: none for half of the drives."""
+    """none, car, van, robot; or varied: none for about half of the drives."""
     stagger: float | None
     readout: float
     images: PictureForm
@@ -111,7 +111,7 @@ def drive_spec(choices: ManyDrives, number: int, attempt: int = 0) -> DriveSpec:
     body = choices.body
     if body == "varied":
         high = min(camera.base_T_camera[2, 3] for camera in layout.complete().cameras) > _CAR_HEIGHT
-        body = dice.weighted({"none": 0.5, "car": 0.4, "van": 0.1} if high else {"none": 0.6, "robot": 0.4})
+        body = dice.weighted({"none": 0.42, "car": 0.48, "van": 0.1} if high else {"none": 0.6, "robot": 0.4})
     stagger = dice.between(0.0, 0.9) if choices.stagger is None else choices.stagger
     changes = {"rate": choices.rate, "stagger": stagger, "readout": choices.readout, "body": body, "lidar": None}
     return DriveSpec(

@@ -6,12 +6,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from cvcdepth_core.obstacles.ground import GroundPlane
+from cvcdepth_core.obstacles.persistence import Persistence
 from cvcdepth_core.obstacles.scan import Scan, ScanLimits, scan_of
 from cvcdepth_core.obstacles.separation import ObstacleLimits, SeparatedCloud, separate
-from cvcdepth_core.pointcloud import Cloud, CloudLimits, banded, merged_cloud, organised_cloud, thinned
+from cvcdepth_core.pointcloud import CameraMoments, Cloud, CloudLimits, banded, merged_cloud, organised_cloud, thinned
 from cvcdepth_core.refinement.drive import VisualMotion
-from cvcdepth_core.rig.rig import Rig
+from cvcdepth_core.stamps import NANOSECONDS
 from cvcdepth_core.surround_depth import SkyChoice, SurroundDepth
 from cvcdepth_ros.messages.camera_discovery import CAMERA_INFO_TYPE, IMAGE_TYPE
 from cvcdepth_ros.messages.conversion import Covariances, MessageFactory
@@ -55,11 +58,24 @@ class OutputLimits(NamedTuple):
     cloud: CloudLimits = CloudLimits()
     obstacles: ObstacleLimits = ObstacleLimits()
     scan: ScanLimits = ScanLimits()
+    deskew: bool = False
+    """Whether points are moved to the cloud's moment, where the vehicle's motion is known."""
+    persistence: int = 0
+    """How many earlier sets must have shown a point too."""
+    has_times: bool = False
+    """Whether points tell by how much later than the cloud's moment they were seen."""
 
     @classmethod
     def of(cls, settings: OutputSettings) -> "OutputLimits":
         """Return those of the settings."""
-        return cls(settings.cloud_limits, settings.obstacle_limits, settings.scan_limits)
+        return cls(
+            settings.cloud_limits,
+            settings.obstacle_limits,
+            settings.scan_limits,
+            settings.cloud_deskew,
+            settings.cloud_persistence,
+            settings.cloud_times,
+        )
 
 
 class OutputMessage(NamedTuple):
@@ -90,8 +106,9 @@ def camera_topics(camera: str) -> list[str]:
 class MergedProducts:
     """What is made of all cameras of a set together; each part is made once, when it is asked for."""
 
-    def __init__(self, result: SurroundDepth, rig: Rig, limits: OutputLimits) -> None:
-        self._result, self._rig, self._limits = result, rig, limits
+    def __init__(self, estimated: EstimatedSet[Any], limits: OutputLimits, persistence: Persistence) -> None:
+        """Make nothing yet; `persistence` remembers the sets before this one."""
+        self._estimated, self._limits, self._persistence = estimated, limits, persistence
 
     @cached_property
     def points(self) -> Cloud:
@@ -103,11 +120,34 @@ class MergedProducts:
     @cached_property
     def separated(self) -> SeparatedCloud:
         """Ground and obstacles."""
-        return separate(self._whole, self._rig.ground_z, self._limits.obstacles)
+        return separate(self._whole, self._estimated.rig.ground_z, self._limits.obstacles)
 
     @cached_property
     def _whole(self) -> Cloud:
-        return merged_cloud(self._result, self._rig, self._limits.cloud.whole)
+        estimated = self._estimated
+        whole = merged_cloud(estimated.result, estimated.rig, self._limits.cloud.whole, self._moments)
+        if not self._limits.persistence:
+            return whole
+        poses, surround_set = estimated.world_T_base, estimated.surround_set
+        place = None if poses is None else poses[estimated.rig.names.index(surround_set.anchor)]
+        return self._persistence.filtered(whole, place, surround_set.time_ns, self._limits.persistence)
+
+    @property
+    def is_deskewed(self) -> bool:
+        """Whether points are moved to the cloud's moment."""
+        return self._limits.deskew and self._estimated.world_T_base is not None
+
+    @property
+    def _moments(self) -> CameraMoments:
+        estimated, rig = self._estimated, self._estimated.rig
+        surround_set, poses = estimated.surround_set, estimated.world_T_base
+        moments = CameraMoments.unmoved(rig)
+        if self._limits.deskew and poses is not None:
+            moments = CameraMoments.moved(rig, poses, rig.names.index(surround_set.anchor))
+        if not self._limits.has_times:
+            return moments
+        times = np.array([surround_set.times_ns.get(name, surround_set.time_ns) for name in rig.names], np.int64)
+        return moments._replace(seconds=(times - surround_set.time_ns) / NANOSECONDS)
 
 
 class SurroundMessages:
@@ -125,6 +165,9 @@ class SurroundMessages:
         self._sky: SkyChoice = sky
         self._encoding = depth_encoding
         self._least = depth_min_confidence
+        self._persistence = Persistence()
+        self.deskewed: bool | None = None
+        """Whether the points of the last merged cloud were moved to its moment; None before any."""
         self.ground: GroundPlane | None = None
         """Where the ground was in the last set whose obstacles were asked for; None before any."""
 
@@ -148,7 +191,7 @@ class SurroundMessages:
                 for part, build in builders.items():
                     if wanted(f"{camera}/{part}"):
                         yield OutputMessage(f"{camera}/{part}", camera, build())
-        for topic, build in self._merged_messages(surround_set.stamp_ns, result, rig, limits).items():
+        for topic, build in self._merged_messages(estimated, limits).items():
             if wanted(topic):
                 yield OutputMessage(topic, surround_set.anchor, build())
         if estimated.visual is not None and wanted(ODOMETRY):
@@ -165,23 +208,26 @@ class SurroundMessages:
             visual.time_ns, _VISUAL_WORLD, base_frame, visual.world_T_base, visual.aligned.twist, errors
         )
 
-    def _merged_messages(
-        self, stamp: int, result: SurroundDepth, rig: Rig, limits: OutputLimits
-    ) -> dict[str, Callable[[], Any]]:
+    def _merged_messages(self, estimated: EstimatedSet[Any], limits: OutputLimits) -> dict[str, Callable[[], Any]]:
         """Return how to build each of the messages about all cameras together."""
-        contained = [name for name, present in zip(rig.names, result.present, strict=True) if present]
+        stamp, rig = estimated.surround_set.stamp_ns, estimated.rig
+        contained = [name for name, present in zip(rig.names, estimated.result.present, strict=True) if present]
         description = {"stamp": stamp, "frame_id": rig.base_frame, "cameras": contained}
-        make, frame, merged = self._factory, rig.base_frame, MergedProducts(result, rig, limits)
+        make, frame, merged = self._factory, rig.base_frame, MergedProducts(estimated, limits, self._persistence)
         return {
-            MERGED_CLOUD: lambda: make.point_cloud(stamp, frame, merged.points),
+            MERGED_CLOUD: lambda: make.point_cloud(stamp, frame, self._noted(merged).points),
             MERGED_CAMERAS: lambda: make.string(json.dumps(description)),
             OBSTACLES: lambda: make.point_cloud(stamp, frame, self._separated(merged).obstacles),
             GROUND: lambda: make.point_cloud(stamp, frame, self._separated(merged).ground),
             SCAN: lambda: make.laser_scan(stamp, frame, self._scan(merged, limits)),
         }
 
+    def _noted(self, merged: MergedProducts) -> MergedProducts:
+        self.deskewed = merged.is_deskewed
+        return merged
+
     def _separated(self, merged: MergedProducts) -> SeparatedCloud:
-        self.ground = merged.separated.plane
+        self.ground = self._noted(merged).separated.plane
         return merged.separated
 
     def _scan(self, merged: MergedProducts, limits: OutputLimits) -> Scan:

@@ -7,11 +7,12 @@ It is given every set in its order. What it remembers belongs to one rig and one
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeVar, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cvcdepth_core.estimator import SurroundDepthEstimator
 from cvcdepth_core.refinement.drive import DriveRefiner, MotionSource, RefinedSet
@@ -52,13 +53,16 @@ class RefinementStage:
         latencies: StageLatencies | None = None,
         follows_always: bool = False,
         knows_motion: Callable[[], bool] = lambda: False,
+        wants_poses: bool = False,
     ) -> None:
         """`wants_confidence` is asked for every set where depth is not refined; `follows_always`: for odometry.
 
-        `knows_motion` is asked where `refine` is auto: whether anything tells how the vehicle moves.
+        `knows_motion` is asked where `refine` is auto: whether anything tells how the vehicle moves. `wants_poses` has
+        every set carry where the vehicle was at the exposures, where that is known.
         """
         self._refine = settings.refine
         self._knows_motion = knows_motion
+        self._wants_poses = wants_poses
         self._grid = RefinementSettings(max_grid_width=settings.refine_width)
         self._poses_at = poses_at
         self._wants_confidence = wants_confidence
@@ -79,7 +83,7 @@ class RefinementStage:
     @property
     def needs_motion(self) -> bool:
         """Whether the vehicle's motion is of use, where there is any."""
-        return self._refine != "off" or self.is_active
+        return self._refine != "off" or self._wants_poses or self.is_active
 
     @property
     def _refines(self) -> bool:
@@ -98,7 +102,8 @@ class RefinementStage:
         """Return the set with what is published of it; `result` is what `surround` has estimated."""
         if not self.is_active:
             self._surround = self._refiner = self.last = None
-            return EstimatedSet(surround_set, surround.rig, result)
+            world_T_base = self._poses(surround_set, surround.rig.names) if self._wants_poses else None
+            return EstimatedSet(surround_set, surround.rig, result, world_T_base=world_T_base)
         refiner = self._refiner_of(surround)
         poses = self._poses_at(surround_set.times_ns)
         with self._latencies.measure("refinement"):
@@ -109,9 +114,12 @@ class RefinementStage:
         depth, confidence = found.depth.depth, found.depth.confidence
         if not self._refines:
             depth, confidence = result.depth, found.depth.prior_confidence
-        return EstimatedSet(
-            surround_set, surround.rig, replace(result, depth=depth, confidence=confidence), found.visual
-        )
+        finished = replace(result, depth=depth, confidence=confidence)
+        return EstimatedSet(surround_set, surround.rig, finished, found.visual, found.world_T_base)
+
+    def _poses(self, surround_set: SurroundSet[T], names: Sequence[str]) -> NDArray[np.float64] | None:
+        poses = self._poses_at(surround_set.times_ns)
+        return None if poses is None else _stacked(poses, names, surround_set.anchor)
 
     def _refiner_of(self, surround: SurroundDepthEstimator) -> DriveRefiner:
         if self._refiner is None or self._surround is not surround:
@@ -138,5 +146,10 @@ def moment_of(
         valid=surround.preprocessor.valid,
         base_T_camera=np.stack([camera.base_T_camera for camera in surround.rig.cameras]),
         times_ns=np.array([times.get(name, surround_set.time_ns) for name in names], dtype=np.int64),
-        world_T_base=None if poses is None else np.stack([poses.get(name, poses[anchor]) for name in names]),
+        world_T_base=None if poses is None else _stacked(poses, names, anchor),
     )
+
+
+def _stacked(poses: Mapping[str, Pose], names: Sequence[str], anchor: str) -> NDArray[np.float64]:
+    """Return the poses [N, 4, 4] of the cameras; that of an absent one is the anchor's."""
+    return np.stack([poses.get(name, poses[anchor]) for name in names])

@@ -7,6 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from cvcdepth_core.errors import ImageError
 from cvcdepth_core.estimator import SurroundDepthEstimator
 from cvcdepth_core.images.decoding import Picture, Reduction
@@ -35,6 +38,8 @@ class EstimatedSet(Generic[T]):
     """Arrays in the order of the rig's cameras."""
     visual: VisualMotion | None = None
     """What the pictures tell of the vehicle's motion; None where they were not followed."""
+    world_T_base: NDArray[np.float64] | None = None
+    """[N, 4, 4] where the vehicle was at each exposure; None where nobody asked for it, or it is not known."""
 
 
 def estimate_set(

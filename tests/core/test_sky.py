@@ -30,7 +30,7 @@ def street(sky=BLUE, horizon: int = 80):
 
 
 def test_depth_at_the_farthest_of_each_camera_is_sky():
-    depth = np.array([[[10.0, 199.0]], [[399.0, 250.0]], [[np.nan, 0.5]]], np.float32)
+    depth = np.array([[[10.0, 199.0]], [[399.0, 150.0]], [[np.nan, 0.5]]], np.float32)
     found = beyond_measure(depth, np.array([300.0, 600.0, 300.0]), max_depth=200.0, focal_scale=300.0)
     assert found.tolist() == [[[False, True]], [[True, False]], [[False, False]]]
 
@@ -61,6 +61,12 @@ def test_pixels_look_up_above_the_horizon_whatever_the_mount():
 )
 def test_in_doubt_there_is_no_sky(picture, why):
     assert not sky_in_picture(picture, upward(), FAR).any(), why
+
+
+def test_pixels_without_depth_do_not_hide_the_sky_around_them():
+    partly = FAR.copy()
+    partly[:30, :100] = np.nan
+    assert sky_in_picture(street(), upward(), partly)[:76].all()
 
 
 def test_a_light_wall_that_the_network_sees_near_is_no_sky():

@@ -71,11 +71,13 @@ def true_motions() -> Tensor:
     return torch.tensor(np.array(motions))[None]
 
 
-def terms(depth: Tensor, motions: Tensor, changed: RigBatch | None = None) -> dict[str, float]:
+def terms(
+    depth: Tensor, motions: Tensor, changed: RigBatch | None = None, config: ObjectiveConfig = OBJECTIVE
+) -> dict[str, float]:
     """The value of each term, mean over the cameras."""
     prediction = Prediction(1 / depth, depth, motions)
     noise = torch.zeros(1, 2, depth.shape[1], 1, HEIGHT, WIDTH, dtype=torch.float64)
-    value = evaluate_objective(changed or batch(), prediction, OBJECTIVE, noise)
+    value = evaluate_objective(changed or batch(), prediction, config, noise)
     return {name: float(term.mean()) for name, term in value.terms.items()}
 
 
@@ -130,6 +132,14 @@ def test_agreement_in_metres_by_itself_draws_depth_near():
     """A known property of the published term (method section 6), which its small weight makes up for; see the next."""
     scales = [terms(s * true_depth(), true_motions())["depth_consistency"] for s in (0.8, 0.9, 1.0, 1.1, 1.2)]
     assert scales == sorted(scales)
+
+
+@pytest.mark.parametrize("name", WRONG_DEPTHS)
+def test_agreement_as_a_share_is_best_at_the_true_depth(name: str):
+    """What no scale makes smaller by itself shows what overlaps know of the scale, weak as their baselines are."""
+    relative = OBJECTIVE.model_copy(update={"depth_difference": "share"})
+    found = terms(WRONG_DEPTHS[name](true_depth()), true_motions(), config=relative)["depth_consistency"]
+    assert found > terms(true_depth(), true_motions(), config=relative)["depth_consistency"]
 
 
 @pytest.mark.parametrize("factor", [0.7, 0.85, 1.15, 1.3])

@@ -59,7 +59,7 @@ def test_mounts_of_neighbours_are_brought_to_agree(tool: Any, recorded: Any, cap
     tool.print_mounts(recorded.rig, mounts)
     assert "| front in front_right |" in capsys.readouterr().out
     told = [pair for pair in mounts.pairs if pair.problem is None]
-    assert len(told) >= 6
+    assert len(told) >= 5
     assert np.mean([pair.after - pair.before for pair in told]) > 0.05
 
 

@@ -85,9 +85,9 @@ class Dice:
         """Return A seed for something's details."""
         return int(self._rng.integers(10_000))
 
-    def natural(self, kind: str, spread: float = 0.35) -> Colour:
-        """Return the colour of such a thing, lighter or darker, and now and then quite another."""
-        if self.chance(0.04):
+    def natural(self, kind: str, spread: float = 0.35, odd: float = 0.04) -> Colour:
+        """Return the colour of such a thing, lighter or darker, and, as often as `odd` says, quite another."""
+        if self.chance(odd):
             return self.any_colour()
         factor = np.exp(self._rng.normal(0.0, spread)) * np.exp(self._rng.normal(0.0, 0.045, 3))
         return _colour(np.array(_NATURAL[kind]) * factor)

@@ -84,7 +84,7 @@ def _storeys(kind: Kind, dice: Dice, wall: WallKind, height: float) -> dict[str,
     if wall == "glass":
         return {"windows": "curtain", "storey": storey, "bay": dice.between(1.5, 4.0), "window": (0.9, 0.9)}
     style = dice.weighted({"single": 0.4, "divided": 0.4, "bands": 0.2 if height > 5 else 0.05})
-    shops = {"shop": kind.shops, "arcade": 0.15 * kind.shops, "same": 1.0 - kind.shops}
+    shops = {"shop": kind.shops, "arcade": 0.25 * kind.shops, "same": 1.0 - kind.shops}
     floors = {"gates": 0.5, "blind": 0.25, "same": 0.25} if hall else shops | {"gates": 0.12, "blind": 0.05}
     return {
         "windows": style,

@@ -80,7 +80,7 @@ class Kind:
 _SEALED: Mapping[SurfaceKind, float] = {"asphalt": 0.85, "concrete": 0.1, "cobbles": 0.05}
 _TOWN_GROUND: Mapping[SurfaceKind, float] = {"asphalt": 0.3, "concrete": 0.2, "slabs": 0.2, "gravel": 0.1, "grass": 0.2}
 _GREEN: Mapping[SurfaceKind, float] = {"grass": 0.88, "dirt": 0.07, "sand": 0.02, "snow": 0.03}
-_TOWN_WALLS: Mapping[WallKind, float] = {"plaster": 0.4, "brick": 0.3, "panels": 0.15, "glass": 0.1, "metal": 0.05}
+_TOWN_WALLS: Mapping[WallKind, float] = {"plaster": 0.38, "brick": 0.28, "panels": 0.15, "glass": 0.14, "metal": 0.05}
 _HOUSE_WALLS: Mapping[WallKind, float] = {"plaster": 0.4, "brick": 0.3, "boards": 0.3}
 
 KINDS: Mapping[WorldKind, Kind] = {

@@ -185,7 +185,7 @@ class _Author:
             lane_width=lane_width,
             edge=edges if lanes else (wide, wide),
             surface=surface,
-            colour=dice.natural(colours.get(surface, "concrete")),
+            colour=dice.natural(colours.get(surface, "concrete"), odd=0.0),
             wear=dice.between(0.05, 0.95),
             kerb=dice.between(0.05, 0.17) if pavement else 0.0,
             pavement=(pavement, pavement if dice.chance(0.85) else 0.0),
@@ -237,6 +237,7 @@ class _Author:
             names = {"asphalt": "asphalt", "dirt": "dirt", "gravel": "gravel", "sand": "sand", "snow": "snow"}
             first, second = (dice.natural(names.get(surface, "concrete")) for _ in range(2))
         waves = tuple(self._wave() for _ in range(dice.whole(1, 3))) if dice.chance(kind.hilly) else ()
+        waves += (self._crest(),) if kind.hilly and dice.chance(0.3) else ()
         rough = dice.between(0.0, 0.6) if surface in ("grass", "dirt", "sand", "snow") else 0.0
         tall = dice.between(0.1, 1.0) if surface in ("grass", "dirt") and dice.chance(kind.tall_grass) else 0.0
         return Ground(surface=surface, colour=first, second=second, waves=waves, rough=rough, tall=tall)
@@ -265,6 +266,14 @@ class _Author:
         return Wave(
             height=height, wavelength=wavelength, direction=dice.between(-60, 60, 0), phase=dice.between(0, 360, 0)
         )
+
+    def _crest(self) -> Wave:
+        """Return what makes the road ahead rise or fall within tens of metres: ground that is not flat close by."""
+        dice = self.dice
+        wavelength = dice.scale(40, 90, 0)
+        height = round(dice.scale(0.012, 0.05) * wavelength / (2 * math.pi), 2)
+        direction, phase = dice.between(-30, 30, 0), dice.between(0, 360, 0)
+        return Wave(height=height, wavelength=wavelength, direction=direction, phase=phase)
 
     def _sky(self) -> Sky:
         dice = self.dice

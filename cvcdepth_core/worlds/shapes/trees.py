@@ -17,6 +17,7 @@ _VARIANTS = 4  # shapes of each kind of tree; size, turn and colour differ besid
 _BARK = (0.1, 0.08, 0.062)
 _WOOD, _LEAF = 0, 1  # materials of a template
 _NEAR, _FAR = 7.0, 25.0  # metres from a road: nearer trees have more and smaller leaves
+_AT_START = 30.0  # metres from where the drive begins, within which trees near a road have the smallest leaves
 
 
 def build_trees(site: Site) -> None:
@@ -40,10 +41,13 @@ def build_trees(site: Site) -> None:
 
 
 def _detail(site: Site, tree: Tree) -> int:
-    """2 for trees beside the way, 1 behind, 0 far off."""
+    """3 for trees beside the way where the drive begins, 2 beside the rest of it, 1 behind, 0 far off."""
     x, y = site.xy(tree.at, tree.road)
     outside = min((-float(c.depth(np.array([[x, y]]))[0]) for c in site.corridors), default=0.0)
-    return 2 if outside < _NEAR else 1 if outside < _FAR else 0
+    begin = site.xy(site.spec.drive.at, site.spec.drive.road)
+    if outside < _NEAR:
+        return 3 if math.dist((x, y), begin) < _AT_START else 2
+    return 1 if outside < _FAR else 0
 
 
 def _trunk_stretched(mesh: Mesh, trunk: float) -> Mesh:
@@ -106,12 +110,12 @@ def _crown(rng: np.random.Generator, tips: Floats, detail: int, narrow: bool) ->
     """Clumps of leaves around the branches' tips, dark inside."""
     wide = 0.09 if narrow else 0.17
     clumps = []
-    count = (24, 45, 110)[detail]
+    count = (24, 45, 110, 340)[detail]
     for tip in tips:
         centre = np.clip(tip, (-0.38, -0.38, 0.36), (0.38, 0.38, 0.9))
         radius = wide * rng.uniform(0.7, 1.15)
         flat = np.array([radius, radius, radius * rng.uniform(0.5, 0.8)])
-        clumps.append(_leaves(rng, centre, flat, count, 0.34 * radius * (1.1, 0.85, 0.55)[detail]))
+        clumps.append(_leaves(rng, centre, flat, count, 0.34 * radius * (1.1, 0.85, 0.55, 0.28)[detail]))
         clumps.append(_core(rng, centre, 0.66 * flat, max(detail - 1, 0)))
     return joined(clumps)
 
@@ -138,25 +142,25 @@ def _core(rng: np.random.Generator, centre: Floats, radii: Floats, subdivisions:
 
 def _bush(rng: np.random.Generator, detail: int) -> Mesh:
     parts = []
-    count = (30, 70, 150)[detail]
+    count = (30, 70, 150, 450)[detail]
     for _ in range(6):
         centre = np.array([*rng.uniform(-0.28, 0.28, 2), rng.uniform(0.22, 0.62)])
         radii = rng.uniform(0.2, 0.34, 3)
-        parts.append(_leaves(rng, centre, radii, count, 0.07 * (1.0, 0.8, 0.6)[detail]))
+        parts.append(_leaves(rng, centre, radii, count, 0.07 * (1.0, 0.8, 0.6, 0.33)[detail]))
         parts.append(_core(rng, centre, 0.8 * radii, max(detail - 1, 0)))
     return joined(parts)
 
 
 def _conifer(rng: np.random.Generator, detail: int) -> Mesh:
     parts = [tube([(0, 0, 0), (0, 0, 0.95)], [0.022, 0.004], _WOOD, 6, closed=False)]
-    levels = (8, 12, 18)[detail]
+    levels = (8, 12, 18, 22)[detail]
     for i in range(levels):
         z = 0.28 + 0.7 * (i + 0.3) / levels
         radius = 0.5 * (1.02 - z) / 0.75
         count = max(4, round(13 * radius / 0.5))
         for k in range(count):
             angle = 2 * math.pi * (k + rng.uniform(0, 0.6)) / count
-            parts.append(_bough(rng, z, angle, radius * rng.uniform(0.75, 1.1), (6, 9, 16)[detail]))
+            parts.append(_bough(rng, z, angle, radius * rng.uniform(0.75, 1.1), (6, 9, 16, 34)[detail]))
     return joined(parts)
 
 
@@ -165,7 +169,7 @@ def _bough(rng: np.random.Generator, z: float, angle: float, reach: float, count
     along = rng.uniform(0.1, 1.0, (count, 1))
     way = np.array([math.cos(angle), math.sin(angle), 0.0])
     places = way * along * reach + (0, 0, z) + np.c_[np.zeros((count, 2)), -0.16 * along * reach + 0.01]
-    spread = 0.05 + 0.16 * reach * (1.15 - along)
+    spread = (0.05 + 0.16 * reach * (1.15 - along)) * (0.6 if count > 20 else 1.0)
     corners = places[:, None] + rng.normal(size=(count, 3, 3)) * spread[:, None] * (0.8, 0.8, 0.28)
     normal = np.array([0.6 * way[0], 0.6 * way[1], 0.75])
     normals = np.broadcast_to(normal / np.linalg.norm(normal), (count, 3, 3)).astype(np.float32)
@@ -178,7 +182,7 @@ def _bough(rng: np.random.Generator, z: float, angle: float, reach: float, count
 def _palm(rng: np.random.Generator, detail: int) -> Mesh:
     z = np.linspace(0, 0.86, 6)
     parts = [tube(np.c_[0.05 * z**2, 0 * z, z], 0.03 - 0.012 * z, _WOOD, 8, closed=False)]
-    for i in range((9, 13, 18)[detail]):
+    for i in range((9, 13, 18, 22)[detail]):
         angle, droop = i * 2.4, rng.uniform(0.1, 0.9)
         t = np.linspace(0, 1, 6)
         out = 0.48 * t

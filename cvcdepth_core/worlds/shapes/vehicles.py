@@ -102,7 +102,9 @@ class _Make:
         self.glass = site.material(window(0.015))
         self.black = site.material(plain((0.022, 0.022, 0.024), 0.5, 0.1))
         self.tyre = site.material(rubber())
-        self.rim = site.material(metal((0.42, 0.42, 0.43)))
+        shade = float(rng.choice([0.42, 0.42, 0.3, 0.12, 0.03]))
+        self.rim = site.material(metal((shade, shade, shade)))
+        self.trim = self.black if rng.random() < 0.5 else self.paint
         self.head = site.material(lamp((0.6, 0.6, 0.58), 9.0 if night else 0.0))
         self.tail = site.material(lamp((0.4, 0.012, 0.012), 5.0 if night else 0.0))
         self.plate = site.material(plain((0.6, 0.6, 0.55), 0.5))
@@ -168,6 +170,8 @@ class _Station(NamedTuple):
 
 
 _SKIRT, _LAMP, _WINDOW, _TOP = slice(0, 2), slice(3, 5), slice(5, 6), slice(6, 8)  # strips of the outline
+_DOOR = slice(2, 5)
+_SEAM = 0.0016  # half the gap beside a door, as a share of the length
 
 
 def _body(make: _Make, shape: _Shape, kind: VehicleKind) -> Mesh:
@@ -213,8 +217,16 @@ def _stations(s: _Shape, kind: VehicleKind) -> list[_Station]:
         along.append((share, s.clearance, belt, s.height, w, glass_wide, roof_wide))
     if s.windows_to:
         along.append((s.windows_to, s.clearance, belt, s.height - 0.005, w, glass_wide, roof_wide))
-    along = sorted(row for row in along if row[0] != pillar)
-    return [_Station(share * s.length - s.length / 2, *rest) for share, *rest in along]
+    rows = np.array(sorted(row for row in along if row[0] != pillar))
+    edges = [share + side * _SEAM for share in _seams(s) for side in (-1.0, 1.0)]
+    rows = np.concatenate([rows, np.stack([np.interp(edges, rows[:, 0], column) for column in rows.T], axis=1)])
+    rows = rows[np.argsort(rows[:, 0], kind="stable")]
+    return [_Station(share * s.length - s.length / 2, *rest) for share, *rest in rows.tolist()]
+
+
+def _seams(s: _Shape) -> tuple[float, float]:
+    """Where doors begin and end, as shares of the length."""
+    return s.cowl - 0.035, max(s.roof[0] + 0.03, s.axles[0] + 0.085)
 
 
 def _skin(make: _Make, s: _Shape, kind: VehicleKind, stations: list[_Station]) -> Floats:
@@ -227,6 +239,8 @@ def _skin(make: _Make, s: _Shape, kind: VehicleKind, stations: list[_Station]) -
         middle = (first + last) / 2
         in_cabin = s.rear_window + 0.01 < middle < s.cowl
         pillar = last - first < 0.03 and s.roof[0] < middle < s.roof[1]
+        if last - first < 2.5 * _SEAM:
+            row[_DOOR] = make.black
         if 0.96 < middle < 0.992:
             row[_LAMP] = make.head
         elif middle < 0.008:
@@ -251,13 +265,14 @@ def _end_cap(ring: Floats, material: int, front: bool) -> Mesh:
 
 def _wheels(make: _Make, s: _Shape) -> Iterator[Mesh]:
     r = s.wheel_radius
-    one = wheel(r, _TYRE_WIDTH, make.tyre, make.rim, spokes=make.black)
+    spokes = make.black if make.rng.random() < 0.7 else None
+    one = wheel(r, _TYRE_WIDTH, make.tyre, make.rim, spokes=spokes)
     for share in s.axles:
         x = share * s.length - s.length / 2
         for side in (-1.0, 1.0):
             y = side * (s.width / 2 - _TYRE_WIDTH / 2 + 0.015)
             yield one.moved(x, y, r)
-            yield _arch(x, side * (s.width / 2 + 0.004), r + 0.02, 1.17 * r, make.black)
+            yield _arch(x, side * (s.width / 2 + 0.004), r + 0.02, 1.1 * r, make.black)
 
 
 def _arch(x: float, y: float, z: float, radius: float, material: int) -> Mesh:
@@ -284,6 +299,9 @@ def _trims(make: _Make, s: _Shape, kind: VehicleKind) -> Iterator[Mesh]:
     yield box(0.06, s.width * 0.7, 0.14, make.black, 0).moved(-f + 0.02, 0, s.clearance + 0.16)
     for x, z in ((f + 0.014, s.bonnet * 0.5), (-f - 0.012, s.boot * 0.66)):
         yield box(0.03, 0.5, 0.11, make.plate, 0).moved(x, 0, z)
+    for share in (_seams(s)[0] - 0.16, _seams(s)[1] + 0.035):
+        for side in (-1.0, 1.0):
+            yield box(0.17, 0.03, 0.03, make.trim, 0).moved(share * s.length - f, side * (w - 0.015), s.belt - 0.13)
     mirror_x = s.cowl * s.length - f - 0.25
     for side in (-1.0, 1.0):
         yield box(0.12, 0.2, 0.14, make.paint, 0, (0.8, 0.8)).moved(mirror_x, side * (w + 0.06), s.belt + 0.02)

@@ -116,7 +116,8 @@ def bark(colour: Colour) -> Material:
 
 def leaves(colour: Colour) -> Material:
     """Crowns and hedges."""
-    coarse, fine = Layer(Noise.CLOUDY, 20.0, 0.2), Layer(Noise.ROUGH, 45.0, 0.25)
+    # Cells of 7 cm with dark borders: close by, the triangles that carry them look like many leaves.
+    coarse, fine = Layer(Noise.CLOUDY, 20.0, 0.2), Layer(Noise.PEBBLES, 230.0, 0.3)
     return Material(lighter(colour, 0.015), darker(colour, 0.6), Pattern.MOTTLED, coarse, fine, leafy=1.0)
 
 

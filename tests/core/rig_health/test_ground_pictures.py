@@ -68,6 +68,16 @@ def test_the_height_of_flat_ground_is_found(height: float):
     assert found.describes.startswith("from pictures, 8 pairs, +-0.0")
 
 
+def test_two_cameras_that_see_the_same_road_at_once_show_it_without_any_motion():
+    mounts = {"left": looking(x=1.2, y=0.35, z=1.1), "right": looking(-5.0, x=1.2, y=-0.35, z=1.1)}
+    found = GroundFromPictures(rig_of(mounts))
+    for number in range(3):
+        left, right = (seen([ground(-0.42)], pose(x=4.0 * number), mount, np.eye(4)) for mount in mounts.values())
+        found.add(left, right)
+        found.add(right, left)
+    assert found.estimate().height == pytest.approx(-0.42, abs=0.03)
+
+
 def test_what_stands_on_the_road_does_not_lift_it():
     car = [Rectangle(pose(x=x, z=0.8), 0.9, 0.8, 7, (0.2, 1.5)) for x in (7.0, 13.0)]
     walls = [Rectangle(pose(y=side, yaw=90), seed=5) for side in (-6.0, 6.0)]
@@ -97,7 +107,7 @@ def test_odometry_that_turns_where_the_vehicle_does_not_fits_no_ground():
             start = pose(x=3.0 * number)
             found.add(
                 seen([ground(0.0)], start, mount, np.eye(4)),
-                seen([ground(0.0)], start @ pose(x=STEP), mount, pose(x=STEP, yaw=4.0)),
+                seen([ground(0.0)], start @ pose(x=STEP), mount, pose(x=STEP, yaw=15.0)),
             )
     assert "fit" in refusal(lambda: found)
 
@@ -107,6 +117,18 @@ def test_a_wrong_focal_length_or_odometry_shows_as_a_wrong_height():
     found: GroundEstimate = search([ground(0.0)], told_step=STEP * 1.2).estimate()
     heights = [mount[2, 3] for mount in MOUNTS.values()]
     assert np.mean(heights) - found.height == pytest.approx(1.2 * np.mean(heights), rel=0.03)
+    longer = np.diag([1.2, 1.2, 1.0]) @ K
+    longer[:2, 2] = K[:2, 2]
+    wrong = GroundFromPictures(rig_of(MOUNTS))
+    for number in range(4):
+        for mount in MOUNTS.values():
+            start = pose(x=3.0 * number)
+            views = (
+                seen([ground(0.0)], start, mount, np.eye(4)),
+                seen([ground(0.0)], start @ pose(x=STEP), mount, pose(x=STEP)),
+            )
+            wrong.add(*(one._replace(view=replace(one.view, intrinsics=longer)) for one in views))
+    assert np.mean(heights) - wrong.estimate().height == pytest.approx(np.mean(heights) / 1.2, rel=0.03)
 
 
 def test_cameras_that_look_at_the_sky_or_aside_show_no_road():
@@ -115,15 +137,14 @@ def test_cameras_that_look_at_the_sky_or_aside_show_no_road():
         (MOUNTS["front"], True),
         (MOUNTS["back"], True),
         (looking(90.0, z=1.1), False),
-        (MOUNTS["front"] @ pitched(-60.0), False),
+        (MOUNTS["front"] @ pitched(60.0), False),
     ]:
         assert shows_road(RoadView(blank, SCENE, PinholeView(K, mount, *SIZE))) is shows
-    own_body = replace(PinholeView(K, MOUNTS["front"], *SIZE))
-    assert not shows_road(RoadView(blank, np.zeros(SIZE, bool), own_body))
+    assert not shows_road(RoadView(blank, np.zeros(SIZE, bool), PinholeView(K, MOUNTS["front"], *SIZE)))
 
 
 def pitched(degrees: float) -> np.ndarray:
-    """A turn of a camera about its own x axis: up for angles below 0."""
+    """A turn of a camera about its own x axis: up for angles above 0."""
     a, turn = math.radians(degrees), np.eye(4)
     turn[1:3, 1:3] = [[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]]
     return turn

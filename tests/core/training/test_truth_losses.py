@@ -152,6 +152,15 @@ def test_what_is_taken_for_the_sky_can_be_left_out_of_what_pictures_teach():
     assert min(shares[False]) > 0.3
 
 
+def test_of_a_network_that_does_not_tell_the_sky_nothing_is_left_out():
+    torch.manual_seed(0)
+    batch = random_batch(2, 3, 32, 48)
+    batch.masks[..., 20:, :] = 0.0
+    noise, prediction = torch.zeros(2, 2, 3, 1, 32, 48, dtype=torch.float64), random_prediction(batch)
+    values = [evaluate_objective(batch, prediction, ObjectiveConfig(leave_out_sky=out), noise) for out in (True, False)]
+    assert torch.equal(values[0].per_sample, values[1].per_sample)
+
+
 TOP, BOTTOM = slice(0, 10), slice(14, None)
 
 

@@ -157,6 +157,7 @@ def back_projected(depth: NDArray[np.float32], info: Any) -> NDArray[np.float64]
     """As depth_image_proc does: with P, pixel centres at the integers."""
     fx, cx, fy, cy = info.p[0], info.p[2], info.p[5], info.p[6]
     v, u = np.mgrid[: depth.shape[0], : depth.shape[1]]
+    depth = np.where(np.isfinite(depth), depth, np.nan)  # the sky is inf
     return np.stack([(u - cx) * depth / fx, (v - cy) * depth / fy, depth], axis=-1)
 
 

@@ -77,11 +77,11 @@ def test_both_are_scored_and_told_in_log_result_and_card(run: Path):
     assert (worlds["share"], worlds["weight"]) == (0.25, 1.0)
     scores = worlds["scores"]
     assert scores["views"] == 4
-    change = scores["after"]["abs_rel"] - scores["before"]["abs_rel"]
+    change = scores["after"]["delta_1"] - scores["before"]["delta_1"]
     assert scores["difference"]["difference"] == pytest.approx(change, abs=1e-4)
-    assert change != 0
+    assert scores["after"] != scores["before"]
     assert not scores["is_worse"]  # four views prove nothing
-    assert "on worlds: Abs Rel" in scores["verdict"]
+    assert "on worlds: δ < 1.25" in scores["verdict"]
     text = (run / "model_card.md").read_text()
     assert "## Worlds" in text
     assert "25% of the pictures" in text

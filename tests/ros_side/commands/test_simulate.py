@@ -11,6 +11,7 @@ import pytest
 from repository import ROOT
 from simple_worlds import short_drive, street_spec, two_cameras
 
+from cvcdepth_core.rig.ground import heights_above_ground
 from cvcdepth_core.rig.rig_file import save_rig_layout
 from cvcdepth_core.worlds.shards import Shard
 from cvcdepth_core.worlds.world_file import load_world, save_world
@@ -75,6 +76,15 @@ def test_many_drives_become_shards(tmp_path: Path, capsys: pytest.CaptureFixture
     assert main(["simulate", *options, "-o", str(tmp_path / "shards")]) == 0
     assert json.loads(capsys.readouterr().out)["drives"] == 2
     assert len({Shard(path).layout for path in (tmp_path / "shards").glob("*.shard.zip")}) == 2
+
+
+@pytest.mark.parametrize("height", [None, 0.0, -0.4])
+def test_a_rigs_cameras_are_as_high_above_the_worlds_ground_as_above_its_own(tmp_path: Path, height: float | None):
+    given = two_cameras().model_copy(update={"ground_height": height})
+    save_rig_layout(tmp_path / "rig.yaml", given)
+    layout = chosen_layout(str(tmp_path / "rig.yaml"), (96, 64), 0)
+    assert layout.ground_height == 0.0
+    assert heights_above_ground(layout.complete()) == pytest.approx(heights_above_ground(given.complete()))
 
 
 @pytest.mark.parametrize("name", KNOWN_RIGS)

@@ -465,7 +465,7 @@ def test_a_set_without_truth_is_not_shown_as_the_best_beside_sets_that_have_it()
 DOCUMENTATION = (ROOT / "docs" / "evaluation.md").read_text(encoding="utf-8")
 NAMES_VARY = re.compile(
     r"scores(\.\*)?|scale_ratio(\.\*)?|scores\.\*\.\*\.(mean|cameras)(\.\*)*|label_free\.rank_correlation_with_abs_rel"
-    r"|label_free\.(mean|cameras(\.\*)?)|references(\.\*\.(scores(\.\*)?|label_free))?"
+    r"|label_free\.(mean|cameras(\.\*)?)|references(\.\*\.(scores(\.\*)?|label_free))?|obstacles\.within"
 )
 
 

@@ -76,7 +76,7 @@ def test_odometry_that_the_pictures_contradict_is_named_and_the_pose_networks_mo
         found = prepared(corrected, tmp_path)
         (index,) = found.indexes
         assert index.poses is None
-        assert len(index) == 20
+        assert len(index) == 19  # of twenty sets one falls apart where the way back begins
         told = describe_motion(index, RecordingsConfig(motion="auto"))
         assert told.startswith("pose network, for odometry jumps: its speed changes by ")
         assert any("odometry jumps" in warning and "so it is not used" in warning for warning in found.warnings)

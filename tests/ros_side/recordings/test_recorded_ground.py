@@ -2,6 +2,7 @@
 """The ground of a recording: stated, found in its LiDAR's sweeps, or neither, and each is told."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,8 @@ from recordings import SAMPLE
 from cvcdepth_core.estimator import untrained_network
 from cvcdepth_core.networks.checkpoint import save_checkpoint
 from cvcdepth_core.networks.registry import DepthModelSpec
-from cvcdepth_core.rig.rig_file import load_rig_layout
+from cvcdepth_core.rig.calibration import Calibration
+from cvcdepth_core.rig.rig_file import PoseEntry, load_rig_layout, save_rig_layout
 from cvcdepth_ros.bag_replay import main
 from cvcdepth_ros.bags import open_recording
 from cvcdepth_ros.recordings.ground import RecordedGround, recorded_ground, with_ground
@@ -55,7 +57,8 @@ def test_without_a_lidar_the_pictures_show_the_road_nearly_as_well():
 def test_where_neither_shows_it_nothing_is_made_up_and_reasons_and_remedy_are_told(standing: Path):
     ground = ground_of(standing, lidar=())
     assert (ground.height, ground.source) == (0.0, "assumed")
-    assert "not stated and was not found (no LiDAR; no recorded motion, which pictures of the road need)" in ground.told
+    assert "not stated and was not found (no LiDAR; 0 pairs of pictures show a road" in ground.told
+    assert "no motion is recorded" in ground.told
     assert "ground_height: -0.4" in ground.told
 
 
@@ -171,6 +174,47 @@ def test_check_compares_what_is_stated_with_what_is_found_and_names_the_remedy(
     skipped = check_of(capsys, "--no-lidar")
     assert skipped["status"] == "skipped"
     assert "ground_height: -0.4" in str(skipped["remedy"])
+
+
+def test_check_names_focal_lengths_where_pictures_and_lidar_disagree(
+    rig_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    longer = load_rig_layout(rig_file)
+    cameras = [
+        camera.model_copy(update={"calibration": with_focal_length(camera.calibration, 1.2)})
+        for camera in longer.cameras
+    ]
+    save_rig_layout(tmp_path / "longer.yaml", longer.model_copy(update={"cameras": tuple(cameras)}))
+    skipped = ("--skip", "mounts", "--skip", "odometry")
+    right = check_of(capsys, "--rig", str(rig_file), "--pictures", *skipped)
+    assert right["status"] == "passed"
+    assert "from pictures, " in str(right["finding"])
+    wrong = check_of(capsys, "--rig", str(tmp_path / "longer.yaml"), "--pictures", *skipped)
+    assert wrong["status"] == "warning"
+    assert re.search(r"by the pictures the cameras are 0\.(7[5-9]|8\d) times as high", str(wrong["finding"]))
+    assert "calibrate the cameras (focal lengths off by +2" in str(wrong["remedy"])
+
+
+def test_check_names_a_rig_whose_cameras_look_at_the_sky(
+    rig_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    layout = load_rig_layout(rig_file)
+    up = PoseEntry(translation=(0.8, 0.0, 1.6), rotation=(0.0, 0.0, 0.0, 1.0))
+    cameras = tuple(camera.model_copy(update={"base_T_camera": up}) for camera in layout.cameras)
+    save_rig_layout(tmp_path / "sky.yaml", layout.model_copy(update={"cameras": cameras}))
+    main(["check", str(SAMPLE), "--quiet", "--json", "--rig", str(tmp_path / "sky.yaml")])
+    (recording,) = json.loads(capsys.readouterr().out)["recordings"]
+    (found,) = (check for check in recording["checks"] if check["name"] == "ground")
+    assert found["status"] == "warning"
+    assert "none looks below the horizon by its transform, so none sees the ground" in found["finding"]
+    assert "transforms" in found["remedy"]
+
+
+def with_focal_length(calibration: Calibration | None, factor: float) -> Calibration:
+    assert calibration is not None
+    scaled = [factor if i in (0, 4) else 1.0 for i in range(9)]
+    k = tuple(value * by for value, by in zip(calibration.k, scaled, strict=True))
+    return calibration.model_copy(update={"k": k, "p": (0.0,) * 12})
 
 
 def test_flat_ground_is_scored_at_the_height_that_was_found(tmp_path: Path):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Our messages through Nav2's voxel marking and ray clearing and depth_image_proc's back-projection, written anew.
 
-The costmap knows nothing of our code: it has the parameters of config/consumers, and the messages.
+The costmap is that of tools/costmap_trial.py: it knows points and the parameters of config/consumers, none of our code.
 """
 
 from collections.abc import Iterator
@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from numpy.typing import NDArray
-from repository import ROOT
+from repository import load_tool
 from street_scene import POST, RIG, WALL, seen
 
 from cvcdepth_ros.messages.conversion import bag_message_factory
@@ -22,7 +21,8 @@ from cvcdepth_ros.surround_sets.synchronizer import SurroundSet
 
 TOPICS = ("obstacles", "ground", "points", "scan", "left/depth/image_rect", "left/depth/camera_info", "left/points")
 CAMERA_HEIGHT = 1.5
-FREE, TAKEN, UNKNOWN = 0, 254, 255
+tool = load_tool("costmap_trial")
+FREE, TAKEN, UNKNOWN = tool.FREE, tool.TAKEN, tool.UNKNOWN
 
 
 def messages(post: bool) -> dict[str, Any]:
@@ -55,69 +55,19 @@ def points_of(cloud: Any) -> NDArray[np.float64]:
     return np.stack([rows[:, offsets[a] : offsets[a] + 4].copy().view("<f4")[:, 0] for a in "xyz"], 1).astype(float)
 
 
-class VoxelCostmap:
-    """Columns of voxels around the vehicle: points mark theirs, rays to points clear those on the way."""
-
-    def __init__(self, layer: dict[str, Any], size: float, resolution: float) -> None:
-        self._layer, self._resolution, self._half = layer, resolution, size / 2
-        cells = round(size / resolution)
-        self._marked = np.zeros((cells, cells, layer["z_voxels"]), bool)
-        self._known = np.zeros((cells, cells, layer["z_voxels"]), bool)
-
-    def update(self, clouds: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]) -> None:
-        """Clear with all sources that do, then mark: `clouds` has, by source, points and where their rays begin."""
-        taken = {source: self._between(source, points) for source, (points, _) in clouds.items()}
-        for source, (_, origin) in clouds.items():
-            if self._layer[source]["clearing"]:
-                self._clear(origin, taken[source], self._layer[source]["raytrace_max_range"])
-        for source, (_, origin) in clouds.items():
-            if self._layer[source]["marking"]:
-                near = np.linalg.norm(taken[source] - origin, axis=1) <= self._layer[source]["obstacle_max_range"]
-                self._set(self._cells(taken[source][near]), marked=True)
-
-    def cost(self, x: float, y: float) -> int:
-        column = tuple(self._cells(np.array([[x, y, 0.0]]))[0, :2].tolist())
-        if self._marked[column].sum() > self._layer["mark_threshold"]:
-            return TAKEN
-        return FREE if self._known[column].any() else UNKNOWN
-
-    def _between(self, source: str, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        low, high = (self._layer[source][f"{end}_obstacle_height"] for end in ("min", "max"))
-        return points[(points[:, 2] >= low) & (points[:, 2] <= high)]
-
-    def _clear(self, origin: NDArray[np.float64], points: NDArray[np.float64], reach: float) -> None:
-        """Clear what the rays cross before their ends, in steps of half a cell."""
-        offsets, ends = points - origin, self._cells(points)
-        lengths = np.linalg.norm(offsets, axis=1)
-        for way in np.arange(0.0, reach, 0.5 * self._resolution):
-            on_way = way < lengths
-            cells = self._cells(origin + offsets[on_way] * (way / lengths[on_way])[:, None])
-            self._set(cells[(cells != ends[on_way]).any(axis=1)], marked=False)
-
-    def _set(self, cells: NDArray[np.int64], marked: bool) -> None:
-        inside = ((cells >= 0) & (cells < self._marked.shape)).all(axis=1)
-        places = tuple(cells[inside].T)
-        self._marked[places], self._known[places] = marked, True
-
-    def _cells(self, points: NDArray[np.float64]) -> NDArray[np.int64]:
-        flat = (points[:, :2] + self._half) / self._resolution
-        high = (points[:, 2:] - self._layer["origin_z"]) / self._layer["z_resolution"]
-        return np.floor(np.concatenate([flat, high], axis=1)).astype(np.int64)
-
-
 @pytest.fixture
-def costmap() -> VoxelCostmap:
-    content = yaml.safe_load((ROOT / "config" / "consumers" / "nav2_costmap.yaml").read_text(encoding="utf-8"))
-    parameters = content["local_costmap"]["local_costmap"]["ros__parameters"]
-    layer = parameters["voxel_layer"]
-    assert layer["observation_sources"].split() == ["obstacles", "points"]
-    return VoxelCostmap(layer, parameters["width"], parameters["resolution"])
+def costmap() -> Any:
+    assert tool.VoxelCostmap.from_file()._layer["observation_sources"].split() == ["obstacles", "points"]
+    return tool.VoxelCostmap.from_file()
 
 
-def clouds(found: dict[str, Any]) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
+def clouds(found: dict[str, Any]) -> dict[str, Any]:
     """The sources of the layer: obstacles from the cloud's own frame, all points from the camera that is named."""
     camera = np.array([0.0, 0.0, CAMERA_HEIGHT])
-    return {"obstacles": (points_of(found["obstacles"]), np.zeros(3)), "points": (points_of(found["points"]), camera)}
+    return {
+        "obstacles": tool.Observation(points_of(found["obstacles"]), np.zeros(3)),
+        "points": tool.Observation(points_of(found["points"]), camera),
+    }
 
 
 def along(x: float, *ys: float) -> Iterator[tuple[float, float]]:

@@ -148,3 +148,56 @@ def test_the_settings_limits_are_the_outputs_limits():
 def test_a_band_of_heights_that_is_empty_is_refused_by_name(kind):
     with pytest.raises(ValueError, match=f"{kind}_min_height 3 must be below {kind}_max_height 2"):
         OutputSettings.model_validate({f"{kind}_min_height": 3.0, f"{kind}_max_height": 2.0})
+
+
+def test_clouds_are_moved_to_the_anchors_moment_where_motion_is_known_and_it_is_told(estimated):
+    later = np.eye(4)
+    later[0, 3] = 2.0
+    moving = replace(estimated, world_T_base=np.stack([np.eye(4), later]))
+    wanted, frames = "points".__eq__, dict.fromkeys(RIG.names, "optical")
+    builder = SurroundMessages(bag_message_factory(), "32FC1")
+
+    def cloud(one: EstimatedSet, deskew: bool) -> np.ndarray:
+        (found,) = builder.of_set(one, frames, OutputLimits(deskew=deskew), wanted)
+        return points(found.message)
+
+    standing = cloud(estimated, False)
+    np.testing.assert_array_equal(cloud(moving, False), standing)
+    assert builder.deskewed is False
+    np.testing.assert_array_equal(cloud(estimated, True), standing)  # nobody knows how the vehicle moved
+    assert builder.deskewed is False
+    moved = cloud(moving, True)
+    assert builder.deskewed is True
+    shift = (moved - standing)[:, 0]
+    np.testing.assert_allclose(np.unique(np.round(shift, 3)), [0.0, 2.0])
+
+
+def test_the_field_t_tells_each_points_exposure(estimated):
+    surround_set = replace(estimated.surround_set, times_ns={"left": STAMP, "right": STAMP + 81_000_000})
+    found = built(
+        replace(estimated, surround_set=surround_set),
+        *("points", "obstacles", "left/points"),
+        limits=OutputLimits(has_times=True),
+    )
+    for topic in ("points", "obstacles"):
+        assert [field.name for field in found[topic].fields] == ["x", "y", "z", "rgb", "t"]
+        assert found[topic].point_step == 20
+        assert len(found[topic].data) == 20 * found[topic].width
+        np.testing.assert_array_equal(np.unique(points(found[topic])[:, 4]), np.float32([0, 0.081]))
+    assert len(found["left/points"].fields) == 4
+
+
+def test_points_that_the_set_before_did_not_show_are_left_out_where_that_is_asked_for(estimated):
+    builder, frames = SurroundMessages(bag_message_factory(), "32FC1"), dict.fromkeys(RIG.names, "optical")
+    places = np.stack([np.eye(4)] * 2)
+
+    def count(surround: Any, time: int) -> int:
+        surround_set = replace(estimated.surround_set, times_ns=dict.fromkeys(RIG.names, time))
+        one = replace(estimated, surround_set=surround_set, result=surround, world_T_base=places)
+        (found,) = builder.of_set(one, frames, OutputLimits(persistence=1), "points".__eq__)
+        return int(found.message.width)
+
+    street, empty = estimated.result, replace(seen(post=False).surround, sky=estimated.result.sky)
+    assert count(empty, STAMP) == np.count_nonzero(~empty.sky)
+    assert count(street, STAMP + 10**8) < np.count_nonzero(~street.sky) - 100  # the post is new
+    assert count(street, STAMP + 2 * 10**8) == np.count_nonzero(~street.sky)

@@ -112,3 +112,21 @@ def test_depth_that_is_not_sure_enough_is_left_out_of_images_and_not_of_what_is_
     np.testing.assert_array_equal(np.isnan(images["left/depth/image_rect"]), ~sure)
     stamps = {(m.header.stamp.sec, m.header.stamp.nanosec, m.header.frame_id) for m in built.values()}
     assert len(stamps) == 1
+
+
+def test_whoever_asks_is_told_where_the_vehicle_was_at_each_exposure(drive):
+    surround, (one, *_) = drive
+    poses = {name: np.eye(4) * (index + 1) for index, name in enumerate(surround.rig.names)}
+    asked: list[set[str]] = []
+
+    def poses_at(times_ns):
+        asked.append(set(times_ns))
+        return poses
+
+    stage = RefinementStage(OFF, poses_at, wants_poses=True)
+    found = stage.finished(surround, one.surround_set, one.result)
+    np.testing.assert_array_equal(found.world_T_base[:, 0, 0], 1 + np.arange(len(poses)))
+    assert RefinementStage(OFF, poses_at).finished(surround, one.surround_set, one.result).world_T_base is None
+    assert asked == [set(surround.rig.names)]
+    unknown = RefinementStage(OFF, lambda _: None, wants_poses=True)
+    assert unknown.finished(surround, one.surround_set, one.result).world_T_base is None

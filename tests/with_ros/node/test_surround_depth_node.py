@@ -21,7 +21,7 @@ from rclpy.qos import ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from recordings import CAMERAS, JAZZY, sample_entries
 from ros_graph import RosGraph, best_effort, reliable
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, LaserScan, PointCloud2
 from std_msgs.msg import Header
 
 from cvcdepth_core.networks import DepthNet
@@ -132,6 +132,7 @@ def test_a_stranger_rebuilds_the_organised_cloud_from_depth_and_camera_info(grap
         assert size == (depth.height, depth.width) == (cloud.height, cloud.width) == (picture.height, picture.width)
 
         metres = np.frombuffer(depth.data, np.float32).reshape(size)
+        metres = np.where(np.isfinite(metres), metres, np.nan)  # the sky is inf
         points = np.frombuffer(cloud.data, np.float32).reshape(*size, cloud.point_step // 4)
         fx, _, cx, _, _, fy, cy, *_ = info.p
         v, u = np.mgrid[: info.height, : info.width]
@@ -161,6 +162,29 @@ def test_the_merged_cloud_is_in_the_base_frame_with_the_anchors_stamp(graph, mes
     # All around the vehicle: some points in each quadrant of the base frame.
     quadrants = {(x > 0, y > 0) for x, y in points[:, :2]}
     assert len(quadrants) == 4
+
+
+def test_obstacles_ground_and_scan_come_to_whoever_subscribes_and_the_ground_is_told(
+    graph, messages, rig_content, tmp_path
+):
+    feed = Feed(graph, messages)
+    kinds = {"obstacles": PointCloud2, "ground": PointCloud2, "scan": LaserScan}
+    for kind, type_ in kinds.items():
+        graph.subscribe(type_, f"/surround_depth/{kind}")
+    start_and_connect(graph, write_rig(tmp_path, rig_content), feed, cloud_deskew=True, scan_resolution=1.0)
+    feed.publish_until(lambda: all(graph.received[f"/surround_depth/{kind}"] for kind in kinds), "what drivers need")
+    scan = graph.received["/surround_depth/scan"][0]
+    assert scan.header.frame_id == "base_link"
+    ranges = np.array(scan.ranges, np.float32)
+    assert len(ranges) == 360
+    known = ranges[np.isfinite(ranges)]
+    assert ((known >= scan.range_min) & (known <= scan.range_max)).all()
+    for kind in ("obstacles", "ground"):
+        cloud = graph.received[f"/surround_depth/{kind}"][0]
+        assert len(cloud.data) == cloud.width * cloud.point_step
+        assert np.isfinite(np.frombuffer(cloud.data, np.float32).reshape(-1, 4)[:, :3]).all()
+    feed.publish_until(lambda: graph.values("ground plane") and graph.values("deskew") is not None, "its diagnostics")
+    assert "height (m)" in graph.values("ground plane")
 
 
 def test_depth_in_millimetres_is_the_depth_in_metres(graph, messages, rig_content, tmp_path):
