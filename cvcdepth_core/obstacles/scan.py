@@ -53,8 +53,8 @@ def scan_of(cloud: SeparatedCloud, limits: ScanLimits, max_range: float) -> Scan
     """Return the nearest obstacle in every direction, up to `max_range` metres."""
     beams = limits.beams
     ranges = np.full(beams, np.nan, dtype=np.float32)
-    ground = cloud.ground
-    ranges[_beams_of(ground[:: max(len(ground) // _MOST_GROUND, 1)], beams)] = np.inf
+    ground = np.flatnonzero(cloud.is_ground)
+    ranges[_beams_of(cloud.points[ground[:: max(len(ground) // _MOST_GROUND, 1)]], beams)] = np.inf
     obstacles = cloud.obstacles
     distances = np.hypot(obstacles[:, 0], obstacles[:, 1])
     inside = (distances >= limits.min_range) & (distances <= max_range)

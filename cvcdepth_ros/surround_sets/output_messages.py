@@ -129,7 +129,7 @@ class MergedProducts:
         if not self._limits.persistence:
             return whole
         poses, surround_set = estimated.world_T_base, estimated.surround_set
-        place = None if poses is None else poses[estimated.rig.names.index(surround_set.anchor)]
+        place = None if poses is None else poses[self._anchor]
         return self._persistence.filtered(whole, place, surround_set.time_ns, self._limits.persistence)
 
     @property
@@ -138,12 +138,18 @@ class MergedProducts:
         return self._limits.deskew and self._estimated.world_T_base is not None
 
     @property
+    def _anchor(self) -> int:
+        """Whose moment is meant: the anchor's; while the rig is incomplete and lacks it, that of its first camera."""
+        names, anchor = self._estimated.rig.names, self._estimated.surround_set.anchor
+        return names.index(anchor) if anchor in names else int(np.argmax(self._estimated.result.present))
+
+    @property
     def _moments(self) -> CameraMoments:
         estimated, rig = self._estimated, self._estimated.rig
         surround_set, poses = estimated.surround_set, estimated.world_T_base
         moments = CameraMoments.unmoved(rig)
         if self._limits.deskew and poses is not None:
-            moments = CameraMoments.moved(rig, poses, rig.names.index(surround_set.anchor))
+            moments = CameraMoments.moved(rig, poses, self._anchor)
         if not self._limits.has_times:
             return moments
         times = np.array([surround_set.times_ns.get(name, surround_set.time_ns) for name in rig.names], np.int64)
