@@ -19,8 +19,8 @@ WIDEST_PINHOLE_DEG = 120.0
 Aspect = Literal["crop", "pad", "stretch"]
 """How a picture comes into a network of another shape."""
 
-# The published method resizes 1936x1216 to 640x384, its pixels 5 % wider than high; 16:9 in 8:5 are 11 % narrower, and were
-# better than padded: networks take what fills the padding for the vehicle.
+# The published method resizes 1936x1216 to 640x384, its pixels 5 % wider than high. Those of 16:9 in 8:5 are 11 %
+# narrower; padded instead, networks took what fills the padding for the vehicle.
 _SQUARE_ENOUGH = 1.12
 
 
