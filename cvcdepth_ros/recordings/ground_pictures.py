@@ -26,7 +26,7 @@ from cvcdepth_ros.surround_sets.synchronizer import SurroundSet
 
 _MOMENTS = 10  # spread over the recording
 _WITHIN_NS = 2 * NANOSECONDS  # of a moment
-_LEAST_TRAVEL, _MOST_TRAVEL = 0.4, 3.0  # metres between two pictures of a pair
+_LEAST_TRAVEL, _MOST_TRAVEL = 0.4, 5.0  # metres between two pictures of a pair
 _TOGETHER_NS = 5_000_000  # between shutters of neighbours that are compared: at 10 m/s 5 cm
 _WIDTH = 640  # pixels
 
@@ -57,12 +57,15 @@ def ground_by_pictures(recorded: RecordedRig, matching: MatchingSettings) -> Gro
     road = _Road(rig)
     if not road.cameras:
         raise RigError("no camera sees the road ahead of the vehicle or behind it")
-    search, moved = GroundFromPictures(rig), 0
+    search, moved, sets = GroundFromPictures(rig), 0, 0
     for start in _starts(recorded):
         pair = _pair(whole, matching, start)
+        sets += pair.first is not None
         moved += pair.second is not None
         for first, second in road.views(pair):
             search.add(first, second)
+    if not sets:
+        raise RigError(f"no surround set at any of {_MOMENTS} moments")
     try:
         return search.estimate()
     except RigError as error:
@@ -73,7 +76,8 @@ def _without_motion(recorded: RecordedRig, moved: int) -> str:
     if recorded.vehicle_motion() is None:
         return "; no motion is recorded, so that only neighbours that fire together could be compared"
     if moved < _MOMENTS // 2:
-        return f"; at {_MOMENTS - moved} of {_MOMENTS} moments the vehicle stands still, or its motion is not known"
+        told = f"; at {_MOMENTS - moved} of {_MOMENTS} moments the vehicle stands still, is too fast for the pictures"
+        return f"{told}, or its motion is not known"
     return ""
 
 
