@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 - the field's name for it
 
+from cvcdepth_core.errors import ConfigError
 from cvcdepth_core.networks.depth import ConvELU, ReflectConv, refuse_input_size
 from cvcdepth_core.networks.encoders import build_encoder
 from cvcdepth_core.networks.rig_images import DepthNetwork, RigImages
@@ -51,10 +52,15 @@ class CrossViewDepthNet(DepthNetwork):
     engines: ClassVar[tuple[str, ...]] = ("torch_eager", "onnxruntime")
 
     def __init__(self, encoder: str, cross_view: CrossViewSpec) -> None:
+        """ConfigError when the heads do not divide the encoder's widths."""
         super().__init__()
         self.cross_view = cross_view
         self.depth_encoder = build_encoder(encoder)
         widths = self.depth_encoder.channels
+        if any(width % cross_view.heads for width in widths):
+            raise ConfigError(
+                f"depth.cross_view.heads is {cross_view.heads}, which does not divide the widths of {encoder}: {widths}"
+            )
         self.fusion = nn.ModuleList(CrossViewTransformer(widths[level], level, cross_view) for level in range(LEVELS))
         self.depth_decoder = PyramidDecoder(widths, self.depth_encoder.decoder_channels, cross_view.scales)
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from cvcdepth_core.errors import CheckpointError
+from cvcdepth_core.errors import CheckpointError, ConfigError
 from cvcdepth_core.networks import DepthModelSpec, PoseNet, RigImages, build_depth_network
 from cvcdepth_core.networks.checkpoint import import_released, load_checkpoint, save_checkpoint
 from cvcdepth_core.networks.cross_view import (
@@ -126,6 +126,12 @@ def test_transformers_are_the_usual_ones_where_none_are_given_and_refused_for_ot
     assert DepthModelSpec(network="surrounddepth", **sizes).cross_view == CrossViewSpec()
     with pytest.raises(ValueError, match="cross_view is given, but the network per_camera has none"):
         DepthModelSpec(cross_view=CrossViewSpec(), **sizes)
+
+
+def test_heads_that_do_not_divide_the_encoders_widths_are_refused_with_both():
+    heads = SPEC.model_copy(update={"cross_view": CrossViewSpec(heads=7)})
+    with pytest.raises(ConfigError, match=r"heads is 7, which does not divide the widths of efficientnet_lite0: \("):
+        build_depth_network(heads)
 
 
 @pytest.fixture
