@@ -171,8 +171,9 @@ def half_precision(state: State) -> dict[str, Tensor]:
 def is_pickle(path: Path) -> bool:
     """Whether a file begins as `torch.save` writes them. Raises OSError when it cannot be read."""
     with path.open("rb") as file:
-        beginning = file.read(2)
-    return beginning == b"PK" or beginning[:1] == pickle.PROTO
+        beginning = file.read(9)
+    is_safetensors = beginning[8:] == b"{"  # after the header's length, whose first byte may be a pickle's
+    return not is_safetensors and (beginning[:2] == b"PK" or beginning[:1] == pickle.PROTO)
 
 
 def load_imagenet_encoder(encoder: Encoder, path: str | Path) -> None:

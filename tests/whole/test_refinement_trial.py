@@ -51,7 +51,7 @@ def test_without_odometry_alignment_finds_most_of_the_gain(tool: Any, recorded: 
         for motion in ("odometry", "alignment", "network")
     }
     assert by["alignment"] < 1.25 * by["odometry"]
-    assert by["network"] > 1.2 * by["odometry"]  # the pose network's 0.2 m, however far the vehicle went
+    assert by["network"] > 1.1 * by["odometry"]  # the pose network tells half of the way
 
 
 def test_mounts_of_neighbours_are_brought_to_agree(tool: Any, recorded: Any, capsys: pytest.CaptureFixture):

@@ -14,6 +14,7 @@ from cvcdepth_core.networks import DepthNet, PoseNet
 from cvcdepth_core.networks.checkpoint import (
     check_sha256,
     import_released,
+    is_pickle,
     load_checkpoint,
     load_imagenet_encoder,
     load_network_state,
@@ -128,6 +129,16 @@ def test_a_file_that_is_no_checkpoint_is_refused_by_name(checkpoint, damage, mes
     with pytest.raises(CheckpointError) as also_told:
         load_spec(checkpoint)
     assert str(also_told.value) == str(told.value)
+
+
+def test_no_length_of_a_header_makes_a_checkpoint_a_pickle(tmp_path):
+    """The header's length comes first, in whole eights: 0x80 is where a pickle begins."""
+    path, begins = tmp_path / "model.safetensors", set()
+    for length in range(0, 256, 8):
+        save_file({"weight": torch.zeros(1)}, path, metadata={"text": "-" * length})
+        begins.add(path.read_bytes()[0])
+        assert not is_pickle(path)
+    assert 0x80 in begins
 
 
 def test_what_it_is_for_can_be_read_alone(checkpoint):

@@ -503,7 +503,7 @@ def test_pictures_tell_which_neighbours_disagree_and_the_remedy(check):
     checks = check(SAMPLE, "--pictures")
     mounts = checks["mounts"]
     assert mounts["status"] == "warning"
-    assert re.match(r"neighbours disagree by [01]\.\d degrees \((front_)?right - (front_)?right\)", mounts["finding"])
+    assert re.match(r"neighbours disagree by [01]\.\d degrees \((front_)?right - front(_right)?\)", mounts["finding"])
     assert "rig BAG --refine" in mounts["remedy"]
     assert checks["odometry"]["finding"] == "too few sets in a row to tell: 10"
 
