@@ -90,7 +90,7 @@ def test_the_own_body_is_found_where_it_is_and_only_there():
     scene, truth = searched("car")
     seen, found = ~truth, ~scene
     assert seen[1].mean() > 0.015
-    assert (found & seen)[1].mean() > 0.65 * seen[1].mean()
+    assert (found & seen)[1].mean() > 0.55 * seen[1].mean()
     assert (found & ~seen).mean(axis=(1, 2)).max() < 0.005
 
 
