@@ -32,7 +32,7 @@ def predict_one_by_one(model: SurroundModel, batch: RigBatch) -> Prediction:
     focal_lengths = batch.intrinsics[..., 0, 0]
     depth = disparity_to_depth(disparity, focal_lengths, model.min_depth, model.max_depth, model.focal_scale)
     no_flip = torch.zeros(len(batch.frames), dtype=torch.bool, device=batch.frames.device)
-    vectors = model._motion_vectors(batch, batch.frames)
+    vectors = model._motion_vectors(batch, batch.frames, no_flip)
     return Prediction(disparity, depth, model._motions(batch, vectors, no_flip))
 
 

@@ -28,6 +28,7 @@ from cvcdepth_core.rig.rig import Rig
 from cvcdepth_core.rig_health.overlap_monitor import OverlapMonitor
 from cvcdepth_core.surround_depth import SurroundDepth
 from cvcdepth_ros.bags import open_recording
+from cvcdepth_ros.recordings.ground import with_ground
 from cvcdepth_ros.recordings.replay import DepthReplay, SurroundReplay
 from cvcdepth_ros.recordings.rig import RecordedRig
 from cvcdepth_ros.settings import MatchingSettings, ModelSettings
@@ -89,7 +90,7 @@ def recorded_drive(path: Path) -> Drive:
     """Estimate all of a recording's sets with the package's own model."""
     estimator = ModelSettings().build_estimator()
     with open_recording(path) as recording:
-        replay = SurroundReplay(RecordedRig.from_recording(recording), MatchingSettings())
+        replay = SurroundReplay(with_ground(RecordedRig.from_recording(recording))[0], MatchingSettings())
         found = list(DepthReplay(replay, estimator).sets())
     rig = found[0].rig
     return Drive(rig, SurroundDepthEstimator(rig, estimator), [estimated.result for estimated in found])

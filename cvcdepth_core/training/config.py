@@ -245,6 +245,12 @@ def load_training_config(path: str | Path, start: DepthModelSpec | None = None) 
         raise ConfigError(f"{path}: {validation_messages(error, TrainingConfig)}") from error
 
 
+def load_dataset(path: str | Path) -> Any:
+    """Return what `dataset` a training configuration names, valid or not; ConfigError names a file that is no YAML."""
+    default = TrainingConfig.model_fields["dataset"].default
+    return _read_with_bases(Path(path), above=()).get("dataset", default)
+
+
 def _with_network(fields: dict[str, Any], start: DepthModelSpec | None) -> dict[str, Any]:
     named = fields.get("depth", {})
     if start is None and "depth" not in fields:

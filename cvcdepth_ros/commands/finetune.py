@@ -83,6 +83,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(arguments: argparse.Namespace) -> None:
     """Train and judge, with the other processes that torchrun started; CvcDepthError says why not."""
+    from cvcdepth_core.training.config import load_training_config
     from cvcdepth_core.training.distributed import launched_processes
     from cvcdepth_ros.finetuning.run import BEST_FILE
 
@@ -90,8 +91,10 @@ def execute(arguments: argparse.Namespace) -> None:
     if arguments.keep_general is not None and not arguments.worlds:
         arguments.usage_error("argument --keep-general: needs --worlds, of which that share is")
     prepare_long_work()
+    path = training_file(arguments.config)
+    _refuse_data_sets(path)
     start = _start(arguments)
-    config = _training_config(training_file(arguments.config), start)
+    config = load_training_config(path, start.spec if start else None)
     if arguments.keep_general is not None:
         worlds = config.worlds.model_copy(update={"share": arguments.keep_general})
         config = config.model_copy(update={"worlds": worlds})
@@ -114,18 +117,17 @@ def _start(arguments: argparse.Namespace) -> "Checkpoint | None":
     return None if arguments.start is None else load_checkpoint(checkpoint_path(arguments.start))
 
 
-def _training_config(path: Path, start: "Checkpoint | None") -> "TrainingConfig":
-    """Read the training file; ConfigError where it is for a data set, of which there is no reader yet."""
-    from cvcdepth_core.training.config import load_training_config
+def _refuse_data_sets(path: Path) -> None:
+    """Raise ConfigError where the training file is not for recordings, before weights are looked for."""
+    from cvcdepth_core.training.config import load_dataset
 
-    config = load_training_config(path, start.spec if start else None)
-    if config.dataset != "recording":
-        why = "for `cvcdepth pretrain`" if config.dataset == "worlds" else "for which there is no reader yet"
+    dataset = load_dataset(path)
+    if dataset in ("worlds", "ddad", "nuscenes"):
+        why = "for `cvcdepth pretrain`" if dataset == "worlds" else "for which there is no reader yet"
         raise ConfigError(
-            f"{path}: dataset is {config.dataset!r}, {why}; to train on recordings, write `dataset: recording` in this "
+            f"{path}: dataset is {dataset!r}, {why}; to train on recordings, write `dataset: recording` in this "
             f"file, or in a new one below `base: {path.resolve()}`"
         )
-    return config
 
 
 def _fine_tuned(job: "FinetuneJob", processes: "Processes") -> "FinetuneResult | None":
@@ -143,12 +145,14 @@ def _fine_tuned(job: "FinetuneJob", processes: "Processes") -> "FinetuneResult |
 
 def _job(arguments: argparse.Namespace, config: "TrainingConfig", start: "Checkpoint | None") -> "FinetuneJob":
     from cvcdepth_core.model_choices import checkpoint_path
+    from cvcdepth_core.networks.checkpoint import load_spec
     from cvcdepth_ros.bags import find_recordings
     from cvcdepth_ros.finetuning.preparation import Source
     from cvcdepth_ros.finetuning.run import FinetuneJob
     from cvcdepth_ros.settings import MatchingSettings
     from cvcdepth_ros.training_data.world_views import find_shards
 
+    judge = checkpoint_path(arguments.start or "")
     source = Source(
         find_recordings(arguments.recordings),
         rig_layout(arguments),
@@ -158,8 +162,8 @@ def _job(arguments: argparse.Namespace, config: "TrainingConfig", start: "Checkp
         lidar_topics(arguments),
         arguments.base_frame,
         config.recordings.motion,
-        config.depth.is_told_its_rig,
-        checkpoint_path(arguments.start or ""),
+        config.depth.is_told_its_rig or load_spec(judge).is_told_its_rig,
+        judge,
     )
     with_promotion = not arguments.no_promotion
     shards = find_shards(arguments.worlds)

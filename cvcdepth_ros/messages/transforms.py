@@ -132,7 +132,10 @@ class TransformTree:
         for frame in self._between(target, source):
             if frame in self.refused:
                 raise TransformError(f"no transform {target} <- {source}: {self.refused[frame]}")
-        return inverse(root_T_target) @ root_T_source
+        found = inverse(root_T_target) @ root_T_source
+        if not np.isfinite(found).all():
+            raise TransformError(f"no transform {target} <- {source}: its links lead farther than a number can say")
+        return found
 
     def _between(self, target: str, source: str) -> list[str]:
         """Return the frames whose links lead from one frame to the other."""

@@ -58,7 +58,14 @@ def corrected(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def prepared(recording: Path, run: Path, motion: MotionSource = "auto") -> Prepared:
     source = Source(
-        [recording], None, MatchingSettings(), tuple(CHECKS), False, (), motion=motion, checkpoint=checkpoint_path("")
+        [recording],
+        None,
+        MatchingSettings(),
+        tuple(CHECKS),
+        False,
+        motion=motion,
+        needs_ground=True,
+        checkpoint=checkpoint_path(""),
     )
     return prepare(source, run)
 

@@ -196,7 +196,7 @@ def test_the_network_is_told_the_delays_that_no_recorded_motion_makes_good_for(i
         settings = EVERYTHING.model_copy(update={"exposure_motion": motion})
         batches = RecordingBatches([recording], config(recordings=settings))
         item = next(i for i, sample in enumerate(batches.reader.samples) if sample.target == 3)
-        return _collate(batches.reader.rigs, [batches.reader[item]])
+        return _collate(batches.reader.rigs, [None], [batches.reader[item]])
 
     told = {
         (name, motion): third(recording, motion).exposure_delays
