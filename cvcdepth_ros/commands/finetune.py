@@ -145,7 +145,6 @@ def _fine_tuned(job: "FinetuneJob", processes: "Processes") -> "FinetuneResult |
 
 def _job(arguments: argparse.Namespace, config: "TrainingConfig", start: "Checkpoint | None") -> "FinetuneJob":
     from cvcdepth_core.model_choices import checkpoint_path
-    from cvcdepth_core.networks.checkpoint import load_spec
     from cvcdepth_ros.bags import find_recordings
     from cvcdepth_ros.finetuning.preparation import Source
     from cvcdepth_ros.finetuning.run import FinetuneJob
@@ -162,7 +161,7 @@ def _job(arguments: argparse.Namespace, config: "TrainingConfig", start: "Checkp
         lidar_topics(arguments),
         arguments.base_frame,
         config.recordings.motion,
-        config.depth.is_told_its_rig or load_spec(judge).is_told_its_rig,
+        config.depth.is_told_its_rig,
         judge,
     )
     with_promotion = not arguments.no_promotion
