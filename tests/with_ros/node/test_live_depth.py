@@ -21,7 +21,7 @@ pytest.importorskip("rclpy", reason="these tests need a ROS environment")
 from nav_msgs.msg import Odometry
 from rclpy.serialization import deserialize_message
 from ros_graph import RosGraph, reliable
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 SIZE = {"height": 64, "width": 96}
 CLASSES = {"sensor_msgs/msg/CompressedImage": CompressedImage, "sensor_msgs/msg/CameraInfo": CameraInfo}
@@ -129,11 +129,16 @@ def test_motion_from_the_pictures_is_published_where_it_is_asked_for(graph: RosG
     entries = [entry for entry in recordings.sample_entries(4) if entry.type in CLASSES]
     publishers = {e.topic: graph.node.create_publisher(CLASSES[e.type], e.topic, reliable()) for e in entries}
     graph.subscribe(Odometry, "/surround_depth/odometry")
+    graph.subscribe(PointCloud2, "/surround_depth/points")
     graph.start_node(rig=rig, publish_odometry=True, max_age=0.0, reliable=True)
     graph.await_matches(publishers.values())
     graph.spin_until(lambda: graph.node.count_publishers("/surround_depth/odometry"), "the topic")
+    clouds, images = graph.received["/surround_depth/points"], 0
     for entry in sorted(entries, key=lambda entry: "CameraInfo" not in entry.type):
         publishers[entry.topic].publish(deserialize_message(entry.cdr, CLASSES[entry.type]))
+        images += "CameraInfo" not in entry.type
+        before = images // len(CAMERAS) - 1  # a busy node would leave sets out
+        graph.spin_until(lambda before=before: len(clouds) >= before, "the set before")
     graph.spin_until(lambda: graph.received["/surround_depth/odometry"], "odometry")
     message = graph.received["/surround_depth/odometry"][-1]
     assert (message.header.frame_id, message.child_frame_id) == ("visual_odom", "base_link")
